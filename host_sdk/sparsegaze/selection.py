@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which recorded frames say where the eye looks: settling, blinks and inattention are marked, never deleted.
+
+Features are unsigned 16-bit log2 photocurrents, 4096 per octave, so a change of light by a fixed *ratio* is the same
+step everywhere and one threshold serves dark and bright channels alike.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+
+# Why a frame is not used. 0 is a usable frame.
+USED, SETTLING, FLAGGED, BLINK, UNSTABLE, INATTENTIVE, OUTSIDE = range(7)
+REASONS = ("used", "settling", "flagged", "blink", "unstable", "inattentive", "outside")
+
+OCTAVE = 4096.0
+LAG_FRAMES = 4              # a lid closes within 50..80 ms = 14..22 frames of 3.6 ms; noise averages over such a lag
+PAD_FRAMES = 6              # lids move slowly before and after the part that a derivative shows
+JUMP_FLOOR = 0.012 * OCTAVE     # steps smaller than this are fixational movement, whatever the noise
+LEVEL_FLOOR = 0.020 * OCTAVE
+JUMP_SIGMAS = 8.0
+LEVEL_SIGMAS = 6.0
+LEAST_SHARE = 0.25          # of a settled fixation that must survive, or none of it is trusted
+LOST_DEG = 6.0              # a fixation this far from where its signals say it is was on another place
+
+
+@dataclass(frozen=True)
+class Selection:
+    """valid bool [n]; reason uint8 [n] (index into REASONS); used_targets, n_targets counts."""
+
+    valid: np.ndarray
+    reason: np.ndarray
+    used_targets: int
+    n_targets: int
+
+    def counts(self):
+        """{reason: number of frames}, only those that occur."""
+        return {name: int(np.sum(self.reason == i)) for i, name in enumerate(REASONS) if np.any(self.reason == i)}
+
+
+def noise_of(features):
+    """Frame-to-frame noise of each channel, feature units rms [d], blind to slow movement and to blinks."""
+    if len(features) < 3:
+        return np.ones(features.shape[1])
+    step = np.diff(features.astype(float), axis=0)
+    return np.maximum(np.median(np.abs(step), axis=0) * 1.4826 / np.sqrt(2.0), 0.5)
+
+
+def _dilate(mask, n):
+    """mask [k] with every true widened by n frames to both sides."""
+    if not mask.any():
+        return mask
+    return np.convolve(mask, np.ones(2 * n + 1), "same") > 0.5
+
+
+def blinks(features, noise=None):
+    """Frames of one fixation that are not steady gaze: bool [n], true = blink, saccade or lid in motion.
+
+    features  [n, d], consecutive frames of one settled fixation; noise: noise_of() the whole recording.
+    Two tests. Derivative: the mean of LAG_FRAMES frames against that of the next LAG_FRAMES, any channel. Level: the
+    steady rest against its own median and MAD, any channel, which finds shut lids between two movements.
+    """
+    x = np.asarray(features, float)
+    n = len(x)
+    if n < 2 * LAG_FRAMES + 1:
+        return np.ones(n, bool)
+    noise = noise_of(x) if noise is None else noise
+    total = np.vstack([np.zeros(x.shape[1]), np.cumsum(x, axis=0)])
+    mean = (total[LAG_FRAMES:] - total[:-LAG_FRAMES]) / LAG_FRAMES
+    step = np.abs(mean[LAG_FRAMES:] - mean[:-LAG_FRAMES])
+    limit = np.maximum(JUMP_SIGMAS * noise * np.sqrt(2.0 / LAG_FRAMES), JUMP_FLOOR)
+    moving = np.zeros(n, bool)
+    moving[LAG_FRAMES:LAG_FRAMES + len(step)] = (step > limit).any(axis=1)
+    moving = _dilate(moving, PAD_FRAMES)
+    steady = ~moving
+    if steady.sum() < LEAST_SHARE * n:
+        return np.ones(n, bool)
+    centre = np.median(x[steady], axis=0)
+    spread = np.median(np.abs(x[steady] - centre), axis=0) * 1.4826
+    level = np.abs(x - centre) > np.maximum(LEVEL_SIGMAS * np.maximum(spread, noise), LEVEL_FLOOR)
+    # One noisy frame is no blink; a lid moves several frames. Median of three votes.
+    far = level.any(axis=1)
+    padded = np.r_[far[:1], far, far[-1:]]
+    far_run = far & (padded[:-2] | padded[2:])
+    return moving | far | _dilate(far_run, PAD_FRAMES)
+
+
+def inattentive(centre, target_deg):
+    """Fixations whose signals belong to another place: bool [k].
+
+    centre [k, d] steady features per fixation, target_deg [k, 2]. A ridge regression quadratic in the principal
+    components predicts each target from the others (closed-form leave-one-out); misses of more than LOST_DEG and
+    of 6 robust deviations are dropped one by one, worst first, each time fitting anew.
+    """
+    k = len(centre)
+    lost = np.zeros(k, bool)
+    if k < 24:
+        return lost
+    x = centre - centre.mean(axis=0)
+    _, s, vt = np.linalg.svd(x, full_matrices=False)
+    p = x @ vt.T[:, : min(4, len(s))]
+    p = p / np.maximum(p.std(axis=0), 1.0)
+    pairs = [p[:, i] * p[:, j] for i in range(p.shape[1]) for j in range(i + 1)]
+    basis = np.column_stack([np.ones(k), p] + pairs)
+    for _ in range(k // 10):
+        keep = np.flatnonzero(~lost)
+        if len(keep) < basis.shape[1] + 4:
+            break
+        b = basis[keep]
+        hat = b @ np.linalg.solve(b.T @ b + 1e-3 * np.eye(b.shape[1]), b.T)
+        miss = (target_deg[keep] - hat @ target_deg[keep]) / np.maximum(1.0 - np.diag(hat), 0.05)[:, None]
+        miss = np.hypot(miss[:, 0], miss[:, 1])
+        worst = int(np.argmax(miss))
+        if miss[worst] < max(LOST_DEG, 6.0 * 1.4826 * float(np.median(miss))):
+            break
+        lost[keep[worst]] = True
+    return lost
+
+
+def select(t_us, features, flagged, target_index, onset_us, target_deg, settle_s):
+    """Mark every frame of a run.
+
+    t_us int64 [n], features [n, d], flagged bool [n] (saturated or starved), target_index int [n] (-1 outside the
+    plan), onset_us int64 [k] when each target really appeared, target_deg [k, 2], settle_s seconds to discard.
+    Returns Selection.
+    """
+    t_us = np.asarray(t_us, np.int64)
+    features = np.asarray(features)
+    index = np.asarray(target_index)
+    reason = np.full(len(t_us), OUTSIDE, np.uint8)
+    noise = noise_of(features)
+    steady = np.full((len(onset_us), features.shape[1]), np.nan)
+    for k, onset in enumerate(onset_us):
+        mine = np.flatnonzero(index == k)
+        reason[mine] = SETTLING
+        rows = mine[t_us[mine] >= onset + int(round(settle_s * 1e6))]
+        if not len(rows):
+            continue
+        bad = np.asarray(flagged)[rows].astype(bool)
+        blink = blinks(features[rows], noise)
+        reason[rows] = np.where(bad, FLAGGED, np.where(blink, BLINK, USED))
+        good = rows[reason[rows] == USED]
+        if len(good) < max(5, LEAST_SHARE * len(rows)):
+            reason[good] = UNSTABLE
+        else:
+            steady[k] = np.median(features[good].astype(float), axis=0)
+    have = np.flatnonzero(np.isfinite(steady[:, 0])) if len(steady) else np.zeros(0, int)
+    for k in have[inattentive(steady[have], np.asarray(target_deg, float)[have])]:
+        reason[(index == k) & (reason == USED)] = INATTENTIVE
+    valid = reason == USED
+    return Selection(valid, reason, len(np.unique(index[valid])), len(onset_us))
