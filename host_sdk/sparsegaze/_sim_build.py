@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Builds `sparsegaze._sim` (cffi, API mode) from sim_c. By hand: python host_sdk/sparsegaze/_sim_build.py
+
+Optional: the SDK streams and calibrates without it; only simulate.py needs it. Wants a C compiler and
+Embree 3 (Debian: libembree-dev)."""
+
+import os
+import re
+import shutil
+import sys
+import tempfile
+
+from cffi import FFI
+
+HERE = os.path.dirname(os.path.abspath(__file__))
+SIM_C = os.path.normpath(os.path.join(HERE, "..", "..", "sim_c"))
+HEADERS = ("sim_map.h",)
+SOURCES = ("sim_map.c",)
+
+
+def cdef_regions():
+    """The text between `// cdef begin` and `// cdef end` of every header: one declaration for both languages."""
+    text = []
+    for name in HEADERS:
+        with open(os.path.join(SIM_C, name), encoding="utf-8") as file:
+            text += re.findall(r"// cdef begin\n(.*?)// cdef end", file.read(), re.S)
+    return re.sub(r"//[^\n]*", "", "\n".join(text))
+
+
+def builder():
+    """The configured FFI object."""
+    ffi = FFI()
+    ffi.cdef(cdef_regions())
+    ffi.set_source(
+        "sparsegaze._sim",
+        "\n".join('#include "%s"' % name for name in HEADERS),
+        sources=[os.path.join(SIM_C, name) for name in SOURCES],
+        include_dirs=[SIM_C],
+        libraries=["m"],
+        extra_compile_args=["-std=c11", "-O3", "-Wall", "-Wextra"],
+    )
+    return ffi
+
+
+def build_in_place(verbose=False):
+    """Compile and put the module beside the sources; returns its path. Raises what the compiler's driver raises."""
+    with tempfile.TemporaryDirectory() as scratch:
+        made = builder().compile(tmpdir=scratch, verbose=verbose)
+        target = os.path.join(HERE, os.path.basename(made))
+        shutil.copyfile(made, target + ".new")
+        os.replace(target + ".new", target)
+    return target
+
+
+if __name__ == "__main__":
+    print(build_in_place("-v" in sys.argv))
