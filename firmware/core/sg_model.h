@@ -63,10 +63,53 @@ struct sg_model_guard {
 };
 // guard page = struct sg_model_guard[8]
 
-// One calibration vector. 13 bytes, read byte by byte: half_c2 (u24, 20.4), c[6] (u8), weight azimuth, elevation (s16).
+// One calibration vector. 13 bytes, read byte by byte: half_c2 (u24, 20.4, below 2^22; 8 * sum c^2 for the exact
+// distance), c[6] (u8), weight azimuth, elevation (s16).
 
 // CRC-32 (IEEE, reflected, init and xorout 0xFFFFFFFF). Start and continue with the returned value; start with 0.
 uint32_t sg_model_crc32(uint32_t crc, const uint8_t *data, size_t n);
+// cdef end
+
+// cdef begin
+// A validated model. The image is borrowed and must neither move nor change while the view is in use.
+struct sg_model_view {
+    const uint8_t *image;
+    uint32_t crc;
+    uint32_t generation;
+    uint16_t length;
+    uint8_t space;              // 0 ordinary memory, 1 program flash (they differ on AVR only)
+    uint8_t vectors;
+    uint8_t channels;
+    uint8_t guards;
+    uint8_t weight_frac_bits;
+    uint8_t reserved;
+};
+
+// sg_model_crc32 over an image in either space. To spread a long check over frames, continue it piece by piece.
+uint32_t sg_model_crc32_at(uint32_t crc, const uint8_t *data, uint16_t n, uint8_t space);
+
+// Validate an image and open it.
+//
+//   view    written only on SG_OK
+//   image   start of the image, any alignment; `room` bytes may be read, no more, whatever they hold
+//   space   0 ordinary memory, 1 program flash
+//
+// Checked, in this order: room for the two pages (SG_E_SHORT), magic (SG_E_MAGIC), version (SG_E_VERSION), the length
+// against vectors, slot (SG_E_BOUNDS) and room (SG_E_SHORT), the CRC (SG_E_CRC), then SG_E_BOUNDS for: channels, kernel,
+// weight_frac_bits or guards outside their ranges; a channel >= d with an offset, gain, trend, guard row entry or centre that is
+// not 0; a guard with low > high; a row not in use, reserved or pad byte that is not 0; half_c2 >= 2^22. sg_gp relies
+// on all of it.
+// Cost      one pass for the CRC, one over the records; on AVR about 70 cycles per byte of the image.
+// Returns   SG_OK or one of the errors above.
+int sg_model_open(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space);
+
+// The same, judged without the CRC pass, for a caller that has just computed it (crc over bytes [8, length)) in
+// pieces.
+int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space, uint32_t crc);
+
+// The length an image claims, for a caller that computes the CRC in pieces: header checks up to SG_E_SHORT as above.
+// Returns the length in bytes, 269..3072, or the error.
+int sg_model_length(const uint8_t *image, uint32_t room, uint8_t space);
 // cdef end
 
 _Static_assert(sizeof(struct sg_model_head) == SG_MODEL_PAGE, "model layout");

@@ -1,0 +1,133 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Write the constant tables of the core: sg_gp_table.c and sg_expose_table.h, beside this script.
+
+    python3 firmware/core/make_tables.py            write both files
+    python3 firmware/core/make_tables.py --check    exit 1 if a committed file differs
+"""
+import math
+import os
+import sys
+
+# The node, nominal (the virtual Nano's parts scatter around it; calibration absorbs a part's own constant).
+JUNCTION_PF = 40.0        # C0, at zero bias
+JUNCTION_V = 0.7          # C(V) = C0 / (1 + V / 0.7 V) ** 0.4
+JUNCTION_POWER = 0.4
+PIN_PF = 6.0
+SAMPLE_HOLD_PF = 14.0
+SUPPLY_V = 5.0
+CODES = 1024
+TIMER_HZ = 16.0e6
+UNIT_A = 62.5e-12         # feature 0
+FEATURE_PER_OCTAVE = 4096
+
+GOAL_FRACTION = 1 / 2.4   # of all charge on the node
+WINDOW_RATIO = 2.1        # either way; above the 1.9 that gaze alone moves the light
+
+LICENSE = "// SPDX-License-Identifier: Apache-2.0\n"
+MADE_BY = "// Made by make_tables.py; edit that.\n"
+
+
+def node_charge_pc(volts):
+    """Charge on the node at a reverse voltage, pC: F(V) = Qj(V) + (C_pin + C_sh) V."""
+    power = 1.0 - JUNCTION_POWER
+    junction = JUNCTION_PF * JUNCTION_V / power * ((1.0 + volts / JUNCTION_V) ** power - 1.0)
+    return junction + (PIN_PF + SAMPLE_HOLD_PF) * volts
+
+
+def collected_pc(code):
+    """Charge collected when the node ends at an ADC code (may be fractional), pC."""
+    return node_charge_pc(SUPPLY_V) - node_charge_pc(SUPPLY_V * code / CODES)
+
+
+def code_at(charge_pc):
+    """Code at which a charge has been collected, by bisection; fractional."""
+    low, high = 0.0, float(CODES)
+    for _ in range(60):
+        middle = (low + high) / 2
+        if collected_pc(middle) > charge_pc:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def rounded(x):
+    """Half up, also for negative numbers."""
+    return math.floor(x + 0.5)
+
+
+def exp_table():
+    """[(level Q0.16, drop Q10.6)] for 2^-(i/64), i = 0..1023.
+
+    The chord lies above the curve and the device floors the interpolation upwards: both means are taken off the
+    nodes, which halves the worst error."""
+    step = math.log(2.0) / 64
+    level = [rounded(65536 * 2.0 ** (-i / 64) * (1 - step * step / 16) - 0.5) for i in range(1025)]
+    return [(level[i], 64 * (level[i] - level[i + 1])) for i in range(1024)]
+
+
+def rows(values, per_row=12):
+    """Numbers as C initialiser lines."""
+    lines = []
+    for i in range(0, len(values), per_row):
+        lines.append("    " + ", ".join(str(v) for v in values[i:i + per_row]) + ",\n")
+    return "".join(lines)
+
+
+def gp_table():
+    """Text of sg_gp_table.c."""
+    values = [v for pair in exp_table() for v in pair]
+    return (LICENSE + MADE_BY + '#include "sg_gp_loop.h"\n#include "sg_rom.h"\n\n'
+            "const uint16_t sg_gp_exp_table[2048] SG_ROM = {\n" + rows(values) + "};\n")
+
+
+def capacitance_log2():
+    """log2 of the mean capacitance over the first 16*i codes of drop, with every constant of the feature, Q4.12."""
+    per_code_v = SUPPLY_V / CODES
+    nodes = []
+    for i in range(65):
+        drop = max(16 * i, 1e-6)
+        mean_pf = collected_pc(CODES - drop) / (drop * per_code_v)
+        nodes.append(rounded(FEATURE_PER_OCTAVE * math.log2(mean_pf * 1e-12 * per_code_v * TIMER_HZ / UNIT_A)))
+    return nodes
+
+
+def expose_table():
+    """Text of sg_expose_table.h."""
+    mantissa = [rounded(FEATURE_PER_OCTAVE * math.log2(1 + i / 64)) for i in range(65)]
+    goal_pc = node_charge_pc(SUPPLY_V) * GOAL_FRACTION
+    goal_feature = rounded(FEATURE_PER_OCTAVE * math.log2(goal_pc * 1e-12 * TIMER_HZ / UNIT_A))
+    return (LICENSE + MADE_BY + "#ifndef SG_EXPOSE_TABLE_H\n#define SG_EXPOSE_TABLE_H\n\n"
+            '#include <stdint.h>\n\n#include "sg_rom.h"\n\n'
+            "// 4096 * log2(1 + i / 64)\n"
+            "static const uint16_t log2_mantissa_q12[65] SG_ROM = {\n" + rows(mantissa) + "};\n\n"
+            "// 4096 * log2(mean capacitance over a drop of 16 * i codes, in units that make the sum a feature)\n"
+            "static const uint16_t log2_capacitance_q12[65] SG_ROM = {\n" + rows(capacitance_log2()) + "};\n\n"
+            "// The charge to aim at: the feature it would have after 1 cycle. And the codes where the window ends.\n"
+            f"#define GOAL_Q12 {goal_feature}L\n"
+            f"#define BRIGHT_CODE {rounded(code_at(goal_pc * WINDOW_RATIO))}U  // goal * {WINDOW_RATIO}\n"
+            f"#define DIM_CODE {rounded(code_at(goal_pc / WINDOW_RATIO))}U  // goal / {WINDOW_RATIO}\n"
+            "\n#endif\n")
+
+
+def main(argv):
+    """Write or check; returns the exit code."""
+    here = os.path.dirname(os.path.abspath(__file__))
+    stale = []
+    for name, text in (("sg_gp_table.c", gp_table()), ("sg_expose_table.h", expose_table())):
+        path = os.path.join(here, name)
+        if argv == ["--check"]:
+            with open(path, encoding="utf-8") as file:
+                if file.read() != text:
+                    stale.append(name)
+        else:
+            with open(path, "w", encoding="utf-8") as file:
+                file.write(text)
+    for name in stale:
+        print(f"{name} is not what make_tables.py makes", file=sys.stderr)
+    return 1 if stale else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

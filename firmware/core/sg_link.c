@@ -1,0 +1,42 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "sg_link.h"
+
+#include "sg_err.h"
+
+_Static_assert(sizeof(((struct sg_link_rx *)0)->frame) == SG_WIRE_FRAME_MAX - 1, "longest frame without delimiter");
+
+static void count(uint16_t *counter)
+{
+    if (*counter != UINT16_MAX)
+        ++*counter;
+}
+
+int sg_link_receive(struct sg_link_rx *rx, uint8_t byte, struct sg_head *head, void *body)
+{
+    const uint8_t fill = rx->fill;
+    if (byte != 0) {
+        if (fill < sizeof rx->frame)
+            rx->frame[fill] = byte;
+        if (fill <= sizeof rx->frame)  // one past the end marks a frame that is too long
+            rx->fill = (uint8_t)(fill + 1U);
+        return SG_E_BUSY;
+    }
+    rx->fill = 0;
+    if (fill == 0)
+        return SG_E_BUSY;
+    const int result = fill > sizeof rx->frame ? (int)SG_E_BOUNDS : sg_wire_decode(rx->frame, fill, head, body);
+    if (result < 0)
+        count(result == SG_E_CRC ? &rx->bad_crc : &rx->bad_length);
+    return result;
+}
+
+int sg_link_feed(struct sg_link_rx *rx, const uint8_t *data, size_t n, size_t *used, struct sg_head *head,
+                 void *body)
+{
+    int result = SG_E_BUSY;
+    size_t i = 0;
+    while (i < n && result == SG_E_BUSY)
+        result = sg_link_receive(rx, data[i++], head, body);
+    *used = i;
+    return result;
+}

@@ -1,0 +1,52 @@
+// SPDX-License-Identifier: Apache-2.0
+// Read-only data that may live in program flash. The only file of the core that asks which architecture it is on.
+//
+// On AVR a pointer does not say which memory it points into, so data that can be in either carries a `space`, and
+// tables of the core are marked SG_ROM and read through sg_rom_word. Everywhere else both are ordinary loads.
+#ifndef SG_ROM_H
+#define SG_ROM_H
+
+#include <stdint.h>
+
+enum sg_rom_space { SG_ROM_MEMORY = 0, SG_ROM_FLASH = 1 };
+
+#ifdef __AVR__
+#include <avr/pgmspace.h>
+#define SG_ROM PROGMEM
+
+static inline uint8_t sg_rom_byte(const uint8_t *p, uint8_t space)
+{
+    return space == SG_ROM_FLASH ? pgm_read_byte(p) : *p;
+}
+
+static inline uint16_t sg_rom_word(const uint16_t *table_entry)
+{
+    return pgm_read_word(table_entry);
+}
+#else
+#define SG_ROM
+
+static inline uint8_t sg_rom_byte(const uint8_t *p, uint8_t space)
+{
+    (void)space;
+    return *p;
+}
+
+static inline uint16_t sg_rom_word(const uint16_t *table_entry)
+{
+    return *table_entry;
+}
+#endif
+
+// Little-endian fields at any alignment.
+static inline uint16_t sg_rom_u16(const uint8_t *p, uint8_t space)
+{
+    return (uint16_t)(sg_rom_byte(p, space) | (uint16_t)((uint16_t)sg_rom_byte(p + 1, space) << 8));
+}
+
+static inline uint32_t sg_rom_u32(const uint8_t *p, uint8_t space)
+{
+    return sg_rom_u16(p, space) | ((uint32_t)sg_rom_u16(p + 2, space) << 16);
+}
+
+#endif

@@ -1,0 +1,99 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "sg_wire.h"
+
+#include "sg_err.h"
+
+static uint16_t crc16_byte(uint16_t crc, uint8_t byte)
+{
+    // x^16 + x^12 + x^5 + 1 divides a byte at once: the quotient of the high byte is itself xor its high nibble.
+    uint8_t t = (uint8_t)((crc >> 8) ^ byte);
+    t = (uint8_t)(t ^ (t >> 4));
+    return (uint16_t)((uint16_t)(crc << 8) ^ (uint16_t)((uint16_t)t << 12) ^ (uint16_t)((uint16_t)t << 5) ^ t);
+}
+
+uint16_t sg_wire_crc16(uint16_t crc, const uint8_t *data, size_t n)
+{
+    for (size_t i = 0; i < n; i++)
+        crc = crc16_byte(crc, data[i]);
+    return crc;
+}
+
+// A COBS group under construction: out[code] waits for its length.
+struct cobs_writer {
+    uint8_t *out;
+    uint8_t code;
+    uint8_t at;
+};
+
+static void cobs_put(struct cobs_writer *w, uint8_t byte)
+{
+    if (byte == 0) {
+        w->out[w->code] = (uint8_t)(w->at - w->code);
+        w->code = w->at++;
+    } else {
+        w->out[w->at++] = byte;
+    }
+}
+
+int sg_wire_encode(const struct sg_head *head, const void *body, size_t body_bytes, uint8_t *out)
+{
+    if (body_bytes > SG_WIRE_BODY_MAX)
+        return SG_E_BOUNDS;
+    // A packet has at most 70 bytes, so no group reaches the 254 bytes at which COBS needs a second rule.
+    struct cobs_writer w = { .out = out, .code = 0, .at = 1 };
+    const uint8_t *body_byte = body;
+    const uint8_t head_byte[SG_WIRE_HEAD_BYTES] = {
+        (uint8_t)head->seq, (uint8_t)(head->seq >> 8), head->type, head->flags,
+    };
+    uint16_t crc = 0xFFFF;
+    for (uint8_t i = 0; i < SG_WIRE_HEAD_BYTES; i++) {
+        crc = crc16_byte(crc, head_byte[i]);
+        cobs_put(&w, head_byte[i]);
+    }
+    for (uint8_t i = 0; i < (uint8_t)body_bytes; i++) {
+        crc = crc16_byte(crc, body_byte[i]);
+        cobs_put(&w, body_byte[i]);
+    }
+    cobs_put(&w, (uint8_t)crc);
+    cobs_put(&w, (uint8_t)(crc >> 8));
+    out[w.code] = (uint8_t)(w.at - w.code);
+    out[w.at++] = 0;
+    return w.at;
+}
+
+int sg_wire_decode(const uint8_t *frame, size_t n, struct sg_head *head, void *body)
+{
+    uint8_t packet[SG_WIRE_PACKET_MAX];
+    uint8_t fill = 0;
+    size_t at = 0;
+    while (at < n) {
+        const uint8_t code = frame[at++];
+        if (code == 0)
+            return SG_E_BOUNDS;
+        if ((size_t)(code - 1U) > n - at)
+            return SG_E_SHORT;
+        for (uint8_t i = 1; i < code; i++) {
+            if (frame[at] == 0 || fill == SG_WIRE_PACKET_MAX)
+                return SG_E_BOUNDS;
+            packet[fill++] = frame[at++];
+        }
+        if (at < n) {  // between two groups stands a zero
+            if (fill == SG_WIRE_PACKET_MAX)
+                return SG_E_BOUNDS;
+            packet[fill++] = 0;
+        }
+    }
+    if (fill < SG_WIRE_HEAD_BYTES + 2)
+        return SG_E_SHORT;
+    const uint8_t body_bytes = (uint8_t)(fill - SG_WIRE_HEAD_BYTES - 2);
+    const uint16_t crc = sg_wire_crc16(0xFFFF, packet, (size_t)(fill - 2U));
+    if (packet[fill - 2] != (uint8_t)crc || packet[fill - 1] != (uint8_t)(crc >> 8))
+        return SG_E_CRC;
+    head->seq = (uint16_t)(packet[0] | (uint16_t)((uint16_t)packet[1] << 8));
+    head->type = packet[2];
+    head->flags = packet[3];
+    uint8_t *out = body;
+    for (uint8_t i = 0; i < body_bytes; i++)
+        out[i] = packet[SG_WIRE_HEAD_BYTES + i];
+    return body_bytes;
+}
