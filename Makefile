@@ -26,7 +26,7 @@ setup: ## install what is missing: Debian packages (when root or sudo), .venv wi
 	@sh tools/setup.sh
 
 firmware: setup ## build the Nano's firmware with PlatformIO, check its link, put the hex into the Python package
-	@$(PY) tools/pio_offline.py run -e nano
+	@$(PY) tools/pio_offline.py run -s -e nano
 	@$(PY) tools/check_link.py .pio/build/nano/firmware.elf
 	@mkdir -p build/firmware $(dir $(HEX))
 	@for f in firmware.elf firmware.hex; do \
