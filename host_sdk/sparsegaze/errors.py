@@ -39,6 +39,7 @@ class DeviceError(SparsegazeError):
     def __init__(self, code, message, remedy=""):
         self.code = int(code)
         super().__init__(message, remedy)
+        self.args = (self.code, self.message, self.remedy)    # so that it pickles
 
 
 class DisconnectedError(PortError):

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A byte stream to a board. Real ports, ptys and pyserial URLs run in real time (SerialLink); a registered unpaced
+virtual Nano runs in lockstep (LockstepLink): its time passes only inside read() and sleep(), so that a run depends on
+its seed and on the calls made, never on how fast this computer is.
+"""
+
+import errno
+import os
+import time
+
+import serial
+
+from . import registry
+from .control import VirtualControl
+from .errors import DisconnectedError, PortError
+
+WRITE_TIMEOUT_S = 5.0
+RESET_PULSE_S = 0.1             # DTR/RTS released: long enough to recharge the Nano's 100 nF
+READ_SLICES_S = (0.2, 0.02, 0.002)
+LOCKSTEP_SLICE_US = 1000        # while waiting for bytes
+LOCKSTEP_SLEEP_US = 20000       # 2000 bytes at 1 Mbaud: a pty holds 4095
+LOCKSTEP_WRITE_BYTES = 1024
+
+
+def open_link(port, baud=1_000_000):
+    """Open `port` ("/dev/ttyUSB0", "COM3", "/dev/cu.usbserial-1", "/dev/pts/5", "socket://host:port", "loop://").
+
+    The port is opened exclusively. Returns a Link. Raises PortError with a remedy.
+    """
+    entry = registry.find(port)
+    if entry is None:
+        return SerialLink(port, baud)
+    control = VirtualControl(entry.control)
+    link_type = LockstepLink if entry.unpaced else SerialLink
+    try:
+        return link_type(port, baud, control, entry.auto_reset)
+    except Exception:
+        control.close()
+        raise
+
+
+class SerialLink:
+    """Real time over pyserial. read() and write() raise DisconnectedError when the port goes away.
+
+    port, baud   as given
+    control      VirtualControl of a virtual Nano, or None
+    """
+
+    def __init__(self, port, baud=1_000_000, control=None, auto_reset=True):
+        self.port = port
+        self.baud = int(baud)
+        self.control = control
+        self.auto_reset = auto_reset
+        self._serial = self._open()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        self.close()
+
+    @property
+    def lockstep(self):
+        return False
+
+    def read(self, n, timeout_s):
+        """Up to `n` bytes as soon as there are any; b"" when none came within `timeout_s`."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            data = self._read_slice(n, deadline - time.monotonic())
+            if data or time.monotonic() >= deadline:
+                return data
+
+    def write(self, data):
+        """Send all of `data`. Raises PortError when the other side takes nothing for 5 s."""
+        try:
+            self._port().write(data)
+        except serial.SerialTimeoutException:
+            raise PortError(f"{self.port} takes no data", "is anything behind this port? `sparsegaze list`") from None
+        except (OSError, TypeError) as error:
+            raise self._gone(error) from None
+
+    def set_baud(self, baud):
+        """Change the speed. Waits until what was written is on the line."""
+        try:
+            if int(baud) != self.baud:
+                self._port().flush()
+                self._port().baudrate = int(baud)
+        except (OSError, ValueError, TypeError) as error:
+            if isinstance(error, ValueError):
+                raise PortError(f"{self.port} cannot do {baud} baud", "use another adapter") from None
+            raise self._gone(error) from None
+        self.baud = int(baud)
+
+    def reset(self):
+        """Reset the board into its bootloader. Returns False when this board has no way to be reset from here."""
+        if self.control is not None:
+            if not self.auto_reset:
+                return False
+            self.control.reset()
+            self.flush_input()
+            return True
+        try:
+            self._port().dtr = False
+            self._port().rts = False
+            self.sleep(RESET_PULSE_S)
+            self._port().dtr = True
+            self._port().rts = True
+        except (OSError, TypeError) as error:
+            if getattr(error, "errno", None) not in (errno.ENOTTY, errno.EINVAL):
+                raise self._gone(error) from None
+            # A pty has no modem lines; what listens behind one takes an opening for the reset.
+            self._serial.close()
+            self._serial = self._open()
+        self.flush_input()
+        return True
+
+    def flush_input(self):
+        """Forget what has arrived and not been read."""
+        try:
+            self._port().reset_input_buffer()
+        except (OSError, TypeError) as error:
+            if getattr(error, "errno", None) == errno.ENOTTY:
+                return
+            raise self._gone(error) from None
+
+    def now(self):
+        """Seconds on the clock in which this link's timeouts run."""
+        return time.monotonic()
+
+    def sleep(self, seconds):
+        time.sleep(seconds)
+
+    def close(self):
+        if self._serial is not None:
+            try:
+                self._serial.close()
+            except OSError:
+                pass
+            self._serial = None
+        if self.control is not None:
+            self.control.close()
+
+    def _open(self):
+        try:
+            handle = serial.serial_for_url(self.port, do_not_open=True)
+            handle.baudrate = self.baud
+            handle.timeout = READ_SLICES_S[0]
+            handle.write_timeout = WRITE_TIMEOUT_S
+            handle.exclusive = True
+            handle.open()
+            return handle
+        except (OSError, ValueError) as error:
+            raise _open_error(self.port, self.baud, error) from None
+
+    def _port(self):
+        if self._serial is None:
+            raise OSError(errno.EBADF, "port is closed")
+        return self._serial
+
+    def _read_slice(self, n, remaining_s):
+        try:
+            handle = self._port()
+            # pyserial reconfigures the port on every change of timeout: a few fixed steps keep that rare.
+            slice_s = next((s for s in READ_SLICES_S if s <= remaining_s), 0 if remaining_s <= 0 else READ_SLICES_S[-1])
+            if handle.timeout != slice_s:
+                handle.timeout = slice_s
+            data = handle.read(1)
+            if data and n > 1:
+                waiting = min(handle.in_waiting, n - 1)
+                if waiting:
+                    data += handle.read(waiting)
+            return data
+        except (OSError, TypeError) as error:
+            raise self._gone(error) from None
+
+    def _gone(self, error):
+        # pyserial's SerialException is an OSError; on a closed handle its select() raises TypeError.
+        return DisconnectedError(f"{self.port} is gone ({_reason(error)})",
+                                 "check the cable, then `sparsegaze list` shows the ports there are")
+
+
+class LockstepLink(SerialLink):
+    """A registered unpaced virtual Nano. now(), sleep() and every timeout are in virtual seconds since power-on."""
+
+    def __init__(self, port, baud=1_000_000, control=None, auto_reset=True):
+        # The clock must already stand when the opening resets the board, or the start would depend on the host.
+        control.lockstep(True)      # byte counts start here
+        super().__init__(port, baud, control, auto_reset)
+        self._sent = 0
+        self._received = 0
+        self._ready = bytearray()
+        self._us = control.time().us
+
+    @property
+    def lockstep(self):
+        return True
+
+    def read(self, n, timeout_s):
+        deadline = self._us + timeout_s * 1e6
+        while not self._ready and self._us < deadline:
+            self._advance(min(self._us + LOCKSTEP_SLICE_US, deadline))
+        data = bytes(self._ready[:n])
+        del self._ready[:n]
+        return data
+
+    def write(self, data):
+        for start in range(0, len(data), LOCKSTEP_WRITE_BYTES):
+            part = data[start:start + LOCKSTEP_WRITE_BYTES]
+            super().write(part)
+            self._sent += len(part)
+            self._advance(self._us)     # no time passes; empties the pty's buffer
+
+    def set_baud(self, baud):
+        self._advance(self._us)
+        super().set_baud(baud)
+
+    def reset(self):
+        if not self.auto_reset:
+            return False
+        self.control.reset()
+        self.flush_input()
+        return True
+
+    def flush_input(self):
+        self._advance(self._us)
+        self._ready.clear()
+
+    def now(self):
+        return self._us * 1e-6
+
+    def sleep(self, seconds):
+        end = self._us + seconds * 1e6
+        while self._us < end:
+            self._advance(min(self._us + LOCKSTEP_SLEEP_US, end))
+
+    def _advance(self, us):
+        before = self._us
+        self._us, device_bytes = self.control.advance(int(round(us)), self._sent)
+        while self._received < device_bytes:
+            data = self._read_slice(device_bytes - self._received, READ_SLICES_S[0])
+            self._received += len(data)
+            self._ready += data
+            if not data and not os.path.exists(self.port):
+                raise self._gone(OSError(errno.EIO, "the virtual Nano stopped"))
+        if us > before and self._us <= before:
+            raise DisconnectedError(f"the clock of the virtual Nano behind {self.port} stands still (power is off)",
+                                    "switch its power on again")
+
+
+def _reason(error):
+    # SerialException carries its cause in its text only.
+    number = getattr(error, "errno", None)
+    if number:
+        return os.strerror(number)
+    return str(error).split("(")[0].strip() or "port is closed"
+
+
+def _open_error(port, baud, error):
+    text = str(error)
+    number = getattr(error, "errno", None)
+    exists = "://" in port or os.path.exists(port) or os.name == "nt"
+    if number == errno.ENOENT or "FileNotFoundError" in text or not exists:
+        return PortError(f"no such port: {port}", "`sparsegaze list` shows the ports there are")
+    if "exclusively lock" in text or "PermissionError" in text or number == errno.EBUSY:
+        return PortError(f"{port} is in use by another program", "close that program and try again")
+    if number == errno.EACCES:
+        return PortError(f"no permission to open {port}", "join the port's group (`sudo usermod -a -G dialout $USER`) and log in again")
+    if isinstance(error, ValueError):
+        return PortError(f"{port} cannot be opened at {baud} baud ({text})", "check the port's name")
+    if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or "Could not configure" in text or os.path.isfile(port):
+        return PortError(f"{port} is not a serial port", "`sparsegaze list` shows the ports there are")
+    return PortError(f"cannot open {port} ({_reason(error)})", "`sparsegaze list` shows the ports there are")

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Packets and messages, through the C codec that the firmware itself is built from (sparsegaze._core).
+
+No layout is written down here: every record below takes its fields from the struct of the C header.
+"""
+
+from collections import namedtuple
+from typing import NamedTuple
+
+from .errors import ProtocolError, SparsegazeError
+
+try:
+    from ._core import ffi, lib
+except ImportError as error:
+    raise SparsegazeError(f"the compiled core of sparsegaze cannot be loaded ({error})",
+                          "run `make setup`, or install the package again") from None
+
+Packet = namedtuple("Packet", "type seq body")
+
+ERROR_TEXT = {
+    lib.SG_E_ARG: "an argument is outside its range", lib.SG_E_RANGE: "a result saturated",
+    lib.SG_E_MAGIC: "there is no stored model", lib.SG_E_VERSION: "the stored model has another format version",
+    lib.SG_E_BOUNDS: "a length, count or index is out of bounds", lib.SG_E_CRC: "a checksum does not match",
+    lib.SG_E_SHORT: "the data end too early", lib.SG_E_UNKNOWN: "this firmware does not know the request",
+    lib.SG_E_STATE: "the request does not fit the present state", lib.SG_E_BUSY: "an earlier request is under way",
+}
+
+
+def record(struct, name):
+    """A named tuple with the fields of a C struct; arrays become tuples."""
+    return namedtuple(name, [field for field, _ in ffi.typeof(struct).fields])
+
+
+class Hello(record("struct sg_hello", "Hello")):
+    """What the device is and can; struct sg_hello."""
+
+    __slots__ = ()
+
+    @property
+    def firmware_text(self):
+        return f"{self.firmware >> 16}.{self.firmware >> 8 & 255}.{self.firmware & 255}"
+
+    @property
+    def board_text(self):
+        return {lib.SG_BOARD_TEMPLATE: "template", lib.SG_BOARD_NANO328P: "Arduino Nano (ATmega328P)"}.get(
+            self.board, f"board {self.board}")
+
+
+class Status(record("struct sg_status", "Status")):
+    """Counters and state; struct sg_status."""
+
+    __slots__ = ()
+
+    @property
+    def exposure_us(self):
+        return tuple(value / 4 for value in self.exposure_us_q2)
+
+    @property
+    def reset_text(self):
+        names = {lib.SG_RESET_POWER: "power", lib.SG_RESET_EXTERNAL: "external",
+                 lib.SG_RESET_BROWNOUT: "brown-out", lib.SG_RESET_WATCHDOG: "watchdog"}
+        return ", ".join(text for bit, text in names.items() if self.reset_cause & bit) or "unknown"
+
+
+class Gaze(record("struct sg_gaze", "Gaze")):
+    """One gaze; struct sg_gaze. Not to be shown as a gaze unless `valid`."""
+
+    __slots__ = ()
+
+    @property
+    def azimuth_deg(self):
+        return self.azimuth_deg_q7 / 128
+
+    @property
+    def elevation_deg(self):
+        return self.elevation_deg_q7 / 128
+
+    @property
+    def valid(self):
+        return bool(self.flags & lib.SG_FLAG_VALID)
+
+
+class Exposure(record("struct sg_exposure", "Exposure")):
+    """Exposures in force; struct sg_exposure."""
+
+    __slots__ = ()
+
+    @property
+    def exposure_us(self):
+        return tuple(value / 4 for value in self.exposure_us_q2)
+
+    @property
+    def automatic(self):
+        return self.op == lib.SG_EXPOSURE_AUTO
+
+
+class Recentre(record("struct sg_recentre", "Recentre")):
+    """Offset in force; struct sg_recentre."""
+
+    __slots__ = ()
+
+    @property
+    def azimuth_deg(self):
+        return self.az_deg_q7 / 128
+
+    @property
+    def elevation_deg(self):
+        return self.el_deg_q7 / 128
+
+
+Pong = record("struct sg_pong", "Pong")
+Raw = record("struct sg_raw", "Raw")
+Counts = record("struct sg_counts", "Counts")
+ModelInfo = record("struct sg_model_info", "ModelInfo")
+Verdict = record("struct sg_model_verdict", "Verdict")
+Mode = record("struct sg_mode", "Mode")
+ModelAt = record("struct sg_model_at", "ModelAt")
+
+_STRUCT = {Hello: "struct sg_hello", Status: "struct sg_status", Gaze: "struct sg_gaze", Pong: "struct sg_pong",
+           Raw: "struct sg_raw", Counts: "struct sg_counts", ModelInfo: "struct sg_model_info", Mode: "struct sg_mode",
+           Verdict: "struct sg_model_verdict", Exposure: "struct sg_exposure", Recentre: "struct sg_recentre",
+           ModelAt: "struct sg_model_at"}
+_SIZE = {kind: ffi.sizeof(name) for kind, name in _STRUCT.items()}
+
+
+class HelloPrefix(NamedTuple):
+    """What stays in place in the HELLO of every protocol version."""
+
+    firmware_text: str
+    wire_version: int           # 0: shorter than any version known
+
+
+def parse(kind, body):
+    """The record `kind` from a message body. A longer body is accepted, its excess ignored. Raises ProtocolError."""
+    if len(body) < _SIZE[kind]:
+        raise ProtocolError(f"the device sent {len(body)} bytes where {kind.__name__} takes {_SIZE[kind]}",
+                            "flash the firmware that belongs to this SDK: `sparsegaze flash PORT`")
+    struct = ffi.from_buffer(_STRUCT[kind] + " *", body)
+    return kind(*[_plain(getattr(struct, field)) for field in kind._fields])
+
+
+def parse_hello_prefix(body):
+    """HelloPrefix of a HELLO answer of any version or length."""
+    struct = ffi.new("struct sg_hello *")
+    ffi.memmove(struct, body, min(len(body), ffi.sizeof("struct sg_hello")))
+    hello = Hello(*[_plain(getattr(struct, field)) for field in Hello._fields])
+    return HelloPrefix(hello.firmware_text, hello.wire_version)
+
+
+def body(struct, **fields):
+    """The bytes of a C struct with the given fields; the others are zero."""
+    value = ffi.new(struct + " *", fields)
+    return bytes(ffi.buffer(value))
+
+
+def data_body(slot, offset, data):
+    """The bytes of struct sg_model_data holding `data` (at most SG_WIRE_DATA_MAX bytes); no more of it travels."""
+    value = ffi.new("struct sg_model_data *", {"offset": offset, "slot": slot, "length": len(data)})
+    ffi.memmove(value.data, data, len(data))
+    return bytes(ffi.buffer(value))[:ffi.offsetof("struct sg_model_data", "data") + len(data)]
+
+
+def parse_data(body_bytes):
+    """(slot, offset, data) of struct sg_model_data. Raises ProtocolError when it is shorter than it says."""
+    start = ffi.offsetof("struct sg_model_data", "data")
+    value = ffi.new("struct sg_model_data *")
+    ffi.memmove(value, body_bytes, min(len(body_bytes), ffi.sizeof("struct sg_model_data")))
+    if value.length > lib.SG_WIRE_DATA_MAX or len(body_bytes) < start + value.length:
+        raise ProtocolError("the device sent less model data than it announced", "try again")
+    return value.slot, value.offset, bytes(ffi.buffer(value.data, value.length))
+
+
+def parse_error(body_bytes):
+    """(code, type of the refused request) of struct sg_error."""
+    value = ffi.new("struct sg_error *")
+    ffi.memmove(value, body_bytes, min(len(body_bytes), ffi.sizeof("struct sg_error")))
+    return value.error, value.type
+
+
+def encode(kind, seq, body_bytes=b""):
+    """One packet as bytes on the wire, delimiter included."""
+    head = ffi.new("struct sg_head *", {"seq": seq & 0xFFFF, "type": kind})
+    out = ffi.new("uint8_t[]", lib.SG_WIRE_FRAME_MAX)
+    n = lib.sg_wire_encode(head, ffi.from_buffer(body_bytes), len(body_bytes), out)
+    if n < 0:
+        raise ProtocolError(f"a message of {len(body_bytes)} bytes does not fit into a packet")
+    return bytes(ffi.buffer(out, n))
+
+
+class Decoder:
+    """Byte stream -> packets, resynchronising at every delimiter; the firmware's own receiver (sg_link).
+
+    good     packets returned
+    bad      frames dropped for their coding, length or CRC
+    heard    the first bytes that arrived before any good packet (at most 64), for messages
+    """
+
+    def __init__(self):
+        self.good = 0
+        self.bad = 0
+        self.heard = b""
+        self._rx = ffi.new("struct sg_link_rx *")
+        self._head = ffi.new("struct sg_head *")
+        self._body = ffi.new("uint8_t[]", lib.SG_WIRE_BODY_MAX)
+        self._used = ffi.new("size_t *")
+
+    def feed(self, data):
+        """Packets completed by `data`, a list of Packet."""
+        packets = []
+        if not self.good and len(self.heard) < 64:
+            self.heard += data[:64 - len(self.heard)]
+        start, buffer = 0, ffi.from_buffer("uint8_t[]", data)
+        while start < len(data):
+            n = lib.sg_link_feed(self._rx, buffer + start, len(data) - start, self._used, self._head, self._body)
+            start += self._used[0]
+            if n >= 0:
+                self.good += 1
+                packets.append(Packet(self._head.type, self._head.seq, bytes(ffi.buffer(self._body, n))))
+            elif n != lib.SG_E_BUSY:
+                self.bad += 1
+        return packets
+
+    def clear(self):
+        """Forget a half-received frame."""
+        self._rx = ffi.new("struct sg_link_rx *")
+
+
+def _plain(value):
+    return value if isinstance(value, int) else tuple(value)
