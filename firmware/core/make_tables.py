@@ -58,12 +58,8 @@ def rounded(x):
 
 
 def exp_table():
-    """[(level Q0.16, drop Q10.6)] for 2^-(i/64), i = 0..1023.
-
-    The chord lies above the curve and the device floors the interpolation upwards: both means are taken off the
-    nodes, which halves the worst error."""
-    step = math.log(2.0) / 64
-    level = [rounded(65536 * 2.0 ** (-i / 64) * (1 - step * step / 16) - 0.5) for i in range(1025)]
+    """[(level Q0.16, drop to the next level Q10.6)] for 2^-(i/64), i = 0..1023."""
+    level = [min(rounded(65536 * 2.0 ** (-i / 64)), 65535) for i in range(1025)]
     return [(level[i], 64 * (level[i] - level[i + 1])) for i in range(1024)]
 
 
@@ -83,13 +79,14 @@ def gp_table():
 
 
 def capacitance_log2():
-    """log2 of the mean capacitance over the first 16*i codes of drop, with every constant of the feature, Q4.12."""
+    """log2 of the mean capacitance over a drop of 16*i codes, with every constant of the feature, Q4.12."""
     per_code_v = SUPPLY_V / CODES
     nodes = []
     for i in range(65):
         drop = max(16 * i, 1e-6)
         mean_pf = collected_pc(CODES - drop) / (drop * per_code_v)
-        nodes.append(rounded(FEATURE_PER_OCTAVE * math.log2(mean_pf * 1e-12 * per_code_v * TIMER_HZ / UNIT_A)))
+        per_code_c = mean_pf * 1e-12 * per_code_v
+        nodes.append(rounded(FEATURE_PER_OCTAVE * math.log2(per_code_c * TIMER_HZ / UNIT_A)))
     return nodes
 
 
@@ -102,9 +99,9 @@ def expose_table():
             '#include <stdint.h>\n\n#include "sg_rom.h"\n\n'
             "// 4096 * log2(1 + i / 64)\n"
             "static const uint16_t log2_mantissa_q12[65] SG_ROM = {\n" + rows(mantissa) + "};\n\n"
-            "// 4096 * log2(mean capacitance over a drop of 16 * i codes, in units that make the sum a feature)\n"
-            "static const uint16_t log2_capacitance_q12[65] SG_ROM = {\n" + rows(capacitance_log2()) + "};\n\n"
-            "// The charge to aim at: the feature it would have after 1 cycle. And the codes where the window ends.\n"
+            "// 4096 * log2(mean capacitance over a drop of 16 * i codes), so that the sum is a feature\n"
+            "static const uint16_t log2_capacitance_q12[65] SG_ROM = {\n" + rows(capacitance_log2()) +
+            "};\n\n// The charge to aim at: the feature it would have after 1 cycle. Where the window ends.\n"
             f"#define GOAL_Q12 {goal_feature}L\n"
             f"#define BRIGHT_CODE {rounded(code_at(goal_pc * WINDOW_RATIO))}U  // goal * {WINDOW_RATIO}\n"
             f"#define DIM_CODE {rounded(code_at(goal_pc / WINDOW_RATIO))}U  // goal / {WINDOW_RATIO}\n"

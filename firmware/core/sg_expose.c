@@ -4,8 +4,8 @@
 #include "sg_expose_table.h"
 #include "sg_rom.h"
 
-// Value between a table entry and the next, Q4.12, rounded half up. fraction < 2^bits <= 512 and neighbours differ by
-// less than 128: the product has 17 bits with its sign.
+// Value between a table entry and the next, Q4.12, rounded half up. fraction < 2^bits <= 512 and neighbours
+// differ by less than 128: the product has 17 bits with its sign.
 static uint16_t interpolated_q12(const uint16_t *entry, uint16_t fraction, uint8_t bits)
 {
     const uint16_t here = sg_rom_word(entry);

@@ -17,7 +17,7 @@ static const uint16_t log2_mantissa_q12[65] SG_ROM = {
     3908, 3956, 4003, 4050, 4096,
 };
 
-// 4096 * log2(mean capacitance over a drop of 16 * i codes, in units that make the sum a feature)
+// 4096 * log2(mean capacitance over a drop of 16 * i codes), so that the sum is a feature
 static const uint16_t log2_capacitance_q12[65] SG_ROM = {
     63522, 63530, 63537, 63545, 63553, 63561, 63569, 63577, 63585, 63594, 63602, 63611,
     63619, 63628, 63637, 63646, 63655, 63664, 63674, 63683, 63693, 63703, 63713, 63723,
@@ -27,7 +27,7 @@ static const uint16_t log2_capacitance_q12[65] SG_ROM = {
     64311, 64339, 64369, 64401, 64435,
 };
 
-// The charge to aim at: the feature it would have after 1 cycle. And the codes where the window ends.
+// The charge to aim at: the feature it would have after 1 cycle. Where the window ends.
 #define GOAL_Q12 100221L
 #define BRIGHT_CODE 100U  // goal * 2.1
 #define DIM_CODE 792U  // goal / 2.1

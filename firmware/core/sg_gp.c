@@ -42,7 +42,8 @@ static uint8_t guarded(const struct sg_model_view *view, const uint16_t s[SG_MOD
     return 0;
 }
 
-int sg_gp_predict(const struct sg_model_view *view, const uint16_t feature[6], int16_t deg_q7[2], uint8_t *flags)
+int sg_gp_predict(const struct sg_model_view *view, const uint16_t feature[6], int16_t deg_q7[2],
+                  uint8_t *flags)
 {
     const uint8_t *image = view->image;
     uint16_t s[SG_MODEL_CHANNELS] = { 0 };

@@ -22,7 +22,8 @@ void sg_gp_loop(uint32_t acc[2], const uint8_t *record, const uint16_t s_u8q4[6]
     uint32_t acc_azimuth = acc[0];
     uint32_t acc_elevation = acc[1];
     for (; n != 0; n--) {
-        int32_t t = (int32_t)(s2 + sg_rom_u16(record, space) + ((uint32_t)sg_rom_byte(record + 2, space) << 16));
+        const uint32_t half_c2 = sg_rom_u16(record, space) + ((uint32_t)sg_rom_byte(record + 2, space) << 16);
+        int32_t t = (int32_t)(s2 + half_c2);
         for (uint8_t j = 0; j < SG_MODEL_CHANNELS; j++)
             t -= (int32_t)((uint32_t)s_u8q4[j] * sg_rom_byte(record + 3 + j, space));
         const uint16_t k_q16 = kernel_q16(t < 0 ? 0UL : (uint32_t)t);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The inner loop of sg_gp. Two twins with identical bits: sg_gp_loop.c, portable, and sg_gp_avr.S. The build links
-// exactly one of them; only sg_gp.c calls it.
+// The inner loop of sg_gp. Two twins with identical bits: sg_gp_loop.c, portable, and sg_gp_avr.S. The build
+// links exactly one of them; only sg_gp.c calls it.
 #ifndef SG_GP_LOOP_H
 #define SG_GP_LOOP_H
 

@@ -3,7 +3,7 @@
 
 #include "sg_err.h"
 
-_Static_assert(sizeof(((struct sg_link_rx *)0)->frame) == SG_WIRE_FRAME_MAX - 1, "longest frame without delimiter");
+_Static_assert(sizeof(((struct sg_link_rx *)0)->frame) == SG_WIRE_FRAME_MAX - 1, "all but the delimiter");
 
 static void count(uint16_t *counter)
 {
@@ -24,7 +24,9 @@ int sg_link_receive(struct sg_link_rx *rx, uint8_t byte, struct sg_head *head, v
     rx->fill = 0;
     if (fill == 0)
         return SG_E_BUSY;
-    const int result = fill > sizeof rx->frame ? (int)SG_E_BOUNDS : sg_wire_decode(rx->frame, fill, head, body);
+    int result = SG_E_BOUNDS;
+    if (fill <= sizeof rx->frame)
+        result = sg_wire_decode(rx->frame, fill, head, body);
     if (result < 0)
         count(result == SG_E_CRC ? &rx->bad_crc : &rx->bad_length);
     return result;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Byte stream to packets: a receiver that takes one byte at a time and finds its way back at the next delimiter
-// after anything.
+// Byte stream to packets: a receiver that takes one byte at a time and finds its way back at the next
+// delimiter after anything.
 #ifndef SG_LINK_H
 #define SG_LINK_H
 
@@ -22,9 +22,9 @@ struct sg_link_rx {
 //
 //   head, body   written when a packet is complete; body holds SG_WIRE_BODY_MAX bytes
 //
-// Returns the body's length (0..64) when this byte ended a good packet; SG_E_BUSY when more bytes are needed (also for the
-// delimiter of an empty frame, which is not an error: senders may lead with one); SG_E_SHORT, SG_E_BOUNDS or
-// SG_E_CRC when it ended a frame that was dropped and counted.
+// Returns the body's length (0..64) when this byte ended a good packet; SG_E_BUSY when more bytes are needed
+// (also for the delimiter of an empty frame, which is not an error: senders may lead with one); SG_E_SHORT,
+// SG_E_BOUNDS or SG_E_CRC when it ended a frame that was dropped and counted.
 int sg_link_receive(struct sg_link_rx *rx, uint8_t byte, struct sg_head *head, void *body);
 
 // Take bytes up to the end of the first frame that is good or bad. *used says how many were taken.

@@ -107,7 +107,8 @@ static int check_records(const uint8_t *record, uint8_t vectors, uint8_t channel
     return SG_OK;
 }
 
-int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space, uint32_t crc)
+int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space,
+                          uint32_t crc)
 {
     const int length = sg_model_length(image, room, space);
     if (length < 0)
@@ -118,7 +119,9 @@ int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint
     const uint8_t channels = sg_rom_byte(image + HEAD(channels), space);
     const uint8_t weight_frac_bits = sg_rom_byte(image + HEAD(weight_frac_bits), space);
     const uint8_t guards = sg_rom_byte(image + HEAD(guards), space);
-    if (channels < 1 || channels > SG_MODEL_CHANNELS || weight_frac_bits < 6 || weight_frac_bits > 10 || guards > 8)
+    if (channels < 1 || channels > SG_MODEL_CHANNELS || guards > 8)
+        return SG_E_BOUNDS;
+    if (weight_frac_bits < 6 || weight_frac_bits > 10)
         return SG_E_BOUNDS;
     if (sg_rom_byte(image + HEAD(kernel), space) != SG_KERNEL_RBF)
         return SG_E_BOUNDS;

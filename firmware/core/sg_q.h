@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The only shifts with rounding and the only saturation of the core. Qm.n: m integer bits, n fraction bits, sign
-// not counted.
+// The only shifts with rounding and the only saturation of the core. Qm.n: m integer bits, n fraction bits,
+// sign not counted.
 #ifndef SG_Q_H
 #define SG_Q_H
 
@@ -19,8 +19,8 @@ static inline int16_t sg_q_sat16(int32_t x)
     return (int16_t)x;
 }
 
-// floor(x / 2^bits + 1/2) for every x, bits in 1..31: the half is added after all bits but one are gone, so that it
-// cannot overflow.
+// floor(x / 2^bits + 1/2) for every x, bits in 1..31: the half is added after all bits but one are gone, so
+// that it cannot overflow.
 static inline int32_t sg_q_round_shift(int32_t x, uint8_t bits)
 {
     return ((x >> (bits - 1U)) + 1) >> 1;

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// Read-only data that may live in program flash. The only file of the core that asks which architecture it is on.
+// Read-only data that may live in program flash. The only file of the core that asks for the architecture.
 //
-// On AVR a pointer does not say which memory it points into, so data that can be in either carries a `space`, and
-// tables of the core are marked SG_ROM and read through sg_rom_word. Everywhere else both are ordinary loads.
+// On AVR a pointer does not say which memory it points into, so data that can be in either carries a `space`,
+// and tables of the core are marked SG_ROM and read through sg_rom_word. Elsewhere both are plain loads.
 #ifndef SG_ROM_H
 #define SG_ROM_H
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// One pipeline step. The device calls these two functions once per frame; `replay` and the bit-identity check call
-// the same functions on the host.
+// One pipeline step. The device calls these two functions once per frame; `replay` and the bit-identity check
+// call the same functions on the host.
 #ifndef SG_TRACK_H
 #define SG_TRACK_H
 
@@ -22,7 +22,8 @@ uint8_t sg_track_features(const uint16_t code[6], const uint16_t exposure_cycles
 //
 //   view              an opened model, or NULL: the gaze is then 0, 0 with SG_FLAG_NO_MODEL
 //   feature           6 features, 1/4096 octave
-//   raw_flags         of the sg_raw the features come from; SATURATED, STARVED, EXPOSURE and TRIAL are passed on
+//   raw_flags         of the sg_raw the features come from; SATURATED, STARVED, EXPOSURE and TRIAL are passed
+//                     on
 //   recentre_deg_q7   added to the model's output (azimuth, elevation), 1/128 deg; the sum saturates
 //   out               whole frame; t_us and infer_us are 0: the caller owns the clock
 // SG_FLAG_VALID is set only when there is a model and none of OUT_OF_RANGE, SATURATED, STARVED is set.

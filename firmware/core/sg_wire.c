@@ -5,10 +5,11 @@
 
 static uint16_t crc16_byte(uint16_t crc, uint8_t byte)
 {
-    // x^16 + x^12 + x^5 + 1 divides a byte at once: the quotient of the high byte is itself xor its high nibble.
+    // x^16 + x^12 + x^5 + 1 divides a byte at once: its quotient is the byte xor its own high nibble.
     uint8_t t = (uint8_t)((crc >> 8) ^ byte);
     t = (uint8_t)(t ^ (t >> 4));
-    return (uint16_t)((uint16_t)(crc << 8) ^ (uint16_t)((uint16_t)t << 12) ^ (uint16_t)((uint16_t)t << 5) ^ t);
+    crc = (uint16_t)(crc << 8);
+    return (uint16_t)(crc ^ (uint16_t)((uint16_t)t << 12) ^ (uint16_t)((uint16_t)t << 5) ^ t);
 }
 
 uint16_t sg_wire_crc16(uint16_t crc, const uint8_t *data, size_t n)

@@ -14,8 +14,8 @@ int sg_batch_infer(const struct sg_model_view *view, const uint16_t *features, c
                    const int16_t recentre_deg_q7[2], struct sg_gaze *out, size_t n);
 
 // sg_expose_feature over n readings. flags[n] or NULL.
-void sg_batch_feature(const uint16_t *code, const uint16_t *exposure_cycles, uint16_t *feature, uint8_t *flags,
-                      size_t n);
+void sg_batch_feature(const uint16_t *code, const uint16_t *exposure_cycles, uint16_t *feature,
+                      uint8_t *flags, size_t n);
 // cdef end
 
 int sg_batch_infer(const struct sg_model_view *view, const uint16_t *features, const uint8_t *raw_flags,
@@ -24,15 +24,16 @@ int sg_batch_infer(const struct sg_model_view *view, const uint16_t *features, c
     int worst = SG_OK;
     for (size_t i = 0; i < n; i++) {
         const uint8_t flags = raw_flags == NULL ? 0 : raw_flags[i];
-        const int result = sg_track_infer(view, features + i * SG_MODEL_CHANNELS, flags, recentre_deg_q7, out + i);
+        const uint16_t *feature = features + i * SG_MODEL_CHANNELS;
+        const int result = sg_track_infer(view, feature, flags, recentre_deg_q7, out + i);
         if (result != SG_OK)
             worst = result;
     }
     return worst;
 }
 
-void sg_batch_feature(const uint16_t *code, const uint16_t *exposure_cycles, uint16_t *feature, uint8_t *flags,
-                      size_t n)
+void sg_batch_feature(const uint16_t *code, const uint16_t *exposure_cycles, uint16_t *feature,
+                      uint8_t *flags, size_t n)
 {
     for (size_t i = 0; i < n; i++) {
         const uint8_t seen = sg_expose_feature(code[i], exposure_cycles[i], feature + i);

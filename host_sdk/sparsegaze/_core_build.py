@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Build ``sparsegaze._core``: the firmware's own core, called from Python through cffi (API mode).
 
-The declarations are cut out of the C headers between the marks ``// cdef begin`` and ``// cdef end``; there is no
-second description of any byte. By hand, from anywhere::
+The declarations are cut out of the C headers between the marks ``// cdef begin`` and ``// cdef end``; there
+is no second description of any byte. By hand, from anywhere::
 
     python host_sdk/sparsegaze/_core_build.py
 
@@ -37,8 +37,8 @@ def cdef_regions(path):
 def make_ffi(core=CORE, root=None):
     """A configured FFI.
 
-    core: directory of the firmware core (a test builds from an altered copy). root: directory that source paths are
-    made relative to, as setuptools wants them; None leaves them absolute."""
+    core: directory of the firmware core (a test builds from an altered copy). root: directory that source
+    paths are made relative to, as setuptools wants them; None leaves them absolute."""
     def place(path):
         return path if root is None else os.path.relpath(path, root)
 
