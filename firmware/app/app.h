@@ -1,0 +1,65 @@
+// SPDX-License-Identifier: Apache-2.0
+// Between the source files of the application: what the pipeline (main.c), the requests (app_requests.c), the models
+// (app_models.c) and the live state (app_live.c) share.
+#ifndef APP_H
+#define APP_H
+
+#include <stdint.h>
+
+#include "hal.h"
+#include "sg_err.h"
+#include "sg_expose.h"
+#include "sg_link.h"
+#include "sg_model.h"
+#include "sg_track.h"
+#include "sg_wire.h"
+
+#define APP_FIRMWARE_VERSION 0x000100UL      // product version, major minor patch: 0.1.0
+
+// Everything that is not a model or a live record. One instance, in main.c.
+struct app_state {
+    struct sg_link_rx link;
+    struct sg_expose_led led[HAL_CHANNELS];
+    struct sg_hello hello;              // filled once; also the source of the exposure limits
+    uint16_t tx_dropped;
+    uint16_t rx_rejected;
+    uint16_t saturated;
+    uint16_t starved;
+    uint16_t exposure_changes;
+    uint8_t stream;                     // bits of enum sg_stream
+    uint8_t exposure_auto;
+};
+extern struct app_state app;
+
+// main.c
+void app_count(uint16_t *counter);                          // up to 65535
+uint16_t app_exposure_limit(uint16_t exposure_cycles);      // into the board's limits, which are inside the core's
+uint8_t app_send(uint8_t type, uint16_t seq, const void *body, uint8_t n, uint8_t keep_free);   // 1 if queued
+
+// app_requests.c
+void app_request(const struct sg_head *head, const uint8_t *body, uint8_t n, uint32_t arrived_us);
+void app_refuse(uint8_t type, uint16_t seq, int8_t error);
+
+// app_models.c
+void app_models_start(void);                                // validate both slots, take the newest
+const struct sg_model_view *app_model(void);                // in use, NULL: none
+uint8_t app_model_slot(void);                               // enum sg_slot of the model in use
+void app_model_info(struct sg_model_info *info);
+int8_t app_model_read(const struct sg_model_at *at, struct sg_model_data *data);
+int8_t app_model_verify(uint8_t slot, uint16_t seq);        // SG_OK: begun, answers by itself when done
+int8_t app_trial_write(const struct sg_model_data *data);
+int8_t app_trial_use(uint16_t seq);                         // SG_OK: begun, answers by itself when done
+int8_t app_trial_leave(struct sg_model_verdict *verdict);    // and what is in use then
+void app_models_step(void);                                 // one piece of a check under way
+
+// app_live.c
+void app_live_start(void);                                  // load, count the boot
+uint16_t app_live_boots(void);
+void app_live_exposures(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t *automatic);     // as stored
+const int16_t *app_recentre(void);                          // in force for the model in use
+void app_recentre_set(int16_t az_deg_q7, int16_t el_deg_q7);
+void app_live_keep_exposures(void);                         // store them as they are now
+void app_live_frame(void);                                  // once per frame: notice exposures that moved and stayed
+void app_live_step(void);
+
+#endif

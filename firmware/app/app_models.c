@@ -1,0 +1,192 @@
+// SPDX-License-Identifier: Apache-2.0
+// Which model is in use, and the checks of models while frames go on. A check runs in pieces between frames: a CRC
+// over a whole slot would take longer than a frame.
+#include "app.h"
+
+#include <stddef.h>
+#include <string.h>
+
+#include "sg_rom.h"
+
+enum { SLOTS = 3, PIECE_BYTES = 64, CRC_FROM = 8 };
+
+// A check under way, of slot `slot`, asked for by request `seq`.
+struct check {
+    uint32_t crc;
+    uint16_t length;
+    uint16_t at;                // 0: none under way
+    uint16_t seq;
+    uint8_t type;               // of the request
+    uint8_t slot;
+};
+
+static struct sg_model_view view[SLOTS];        // length 0: not a model
+static int8_t verdict[SLOTS];
+static uint8_t active = SG_SLOT_NONE;
+static uint8_t stored = SG_SLOT_NONE;           // what TRIAL_USE 0 goes back to
+static struct check check;
+static uint8_t trial[HAL_TRIAL_BYTES];
+
+static const uint8_t *slot_image(uint8_t slot)
+{
+    return slot == SG_SLOT_RAM ? trial : hal_slot(slot);
+}
+
+static uint16_t slot_room(uint8_t slot)
+{
+    return slot == SG_SLOT_RAM ? (uint16_t)HAL_TRIAL_BYTES : (uint16_t)app.hello.slot_bytes;
+}
+
+static uint8_t slot_space(uint8_t slot)
+{
+    return slot == SG_SLOT_RAM ? (uint8_t)SG_ROM_MEMORY : (uint8_t)HAL_SLOT_SPACE;
+}
+
+static void forget(uint8_t slot, int8_t why)
+{
+    memset(&view[slot], 0, sizeof view[slot]);
+    verdict[slot] = why;
+}
+
+void app_models_start(void)
+{
+    for (uint8_t slot = SG_SLOT_A; slot <= SG_SLOT_B; slot++) {
+        const uint8_t *image = hal_slot(slot);
+        forget(slot, SG_E_MAGIC);
+        if (!image)
+            continue;
+        verdict[slot] = (int8_t)sg_model_open(&view[slot], image, slot_room(slot), slot_space(slot));
+        if (verdict[slot] == SG_OK
+            && (stored == SG_SLOT_NONE || (int32_t)(view[slot].generation - view[stored].generation) > 0))
+            stored = slot;
+    }
+    forget(SG_SLOT_RAM, SG_E_MAGIC);
+    active = stored;
+}
+
+const struct sg_model_view *app_model(void)
+{
+    return active == SG_SLOT_NONE ? NULL : &view[active];
+}
+
+uint8_t app_model_slot(void)
+{
+    return active;
+}
+
+void app_model_info(struct sg_model_info *info)
+{
+    memset(info, 0, sizeof *info);
+    for (uint8_t slot = 0; slot < SLOTS; slot++) {
+        info->crc[slot] = view[slot].crc;
+        info->generation[slot] = view[slot].generation;
+        info->vectors[slot] = view[slot].vectors;
+        info->channels[slot] = view[slot].channels;
+        info->verdict[slot] = verdict[slot];
+    }
+    info->active = active;
+}
+
+int8_t app_model_read(const struct sg_model_at *at, struct sg_model_data *data)
+{
+    if (at->slot >= SLOTS || at->length < 1 || at->length > SG_WIRE_DATA_MAX)
+        return SG_E_ARG;
+    const uint8_t *image = slot_image(at->slot);
+    const uint16_t room = slot_room(at->slot);
+    if (!image || at->length > room || at->offset > room - at->length)
+        return SG_E_BOUNDS;
+    data->offset = at->offset;
+    data->slot = at->slot;
+    data->length = at->length;
+    for (uint8_t i = 0; i < at->length; i++)
+        data->data[i] = sg_rom_byte(image + at->offset + i, slot_space(at->slot));
+    return SG_OK;
+}
+
+static void answer(int8_t result)
+{
+    struct sg_model_verdict body = { .crc = check.crc, .verdict = result, .slot = check.slot };
+    // Not queued only while the line is full of answers: ask again in the next turn.
+    if (!app_send(check.type | SG_REPLY, check.seq, &body, sizeof body, 0))
+        return;
+    check.at = 0;
+    if (check.type == SG_MSG_TRIAL_USE && result == SG_OK)
+        active = SG_SLOT_RAM;
+}
+
+// The header alone decides how far to read; one that is wrong is answered for at once, with CRC 0.
+static int8_t begin(uint8_t type, uint8_t slot, uint16_t seq)
+{
+    const uint8_t *image = slot_image(slot);
+    if (!image)
+        return SG_E_BOUNDS;
+    if (check.at)
+        return SG_E_BUSY;
+    const int length = sg_model_length(image, slot_room(slot), slot_space(slot));
+    check = (struct check){ .length = length < 0 ? 0 : (uint16_t)length, .at = CRC_FROM, .seq = seq, .type = type,
+                            .slot = slot };
+    return SG_OK;
+}
+
+int8_t app_model_verify(uint8_t slot, uint16_t seq)
+{
+    if (slot >= SLOTS)
+        return SG_E_ARG;
+    return begin(SG_MSG_MODEL_VERIFY, slot, seq);
+}
+
+int8_t app_trial_use(uint16_t seq)
+{
+    return begin(SG_MSG_TRIAL_USE, SG_SLOT_RAM, seq);
+}
+
+int8_t app_trial_leave(struct sg_model_verdict *body)
+{
+    if (check.at && check.type == SG_MSG_TRIAL_USE)
+        return SG_E_BUSY;
+    active = stored;
+    memset(body, 0, sizeof *body);
+    body->slot = active;
+    body->crc = active == SG_SLOT_NONE ? 0 : view[active].crc;
+    body->verdict = active == SG_SLOT_NONE ? SG_E_STATE : SG_OK;
+    return SG_OK;
+}
+
+int8_t app_trial_write(const struct sg_model_data *data)
+{
+    if (data->slot != SG_SLOT_RAM || data->length < 1 || data->length > SG_WIRE_DATA_MAX)
+        return SG_E_ARG;
+    if (data->offset > (uint16_t)HAL_TRIAL_BYTES || data->length > (uint16_t)HAL_TRIAL_BYTES - data->offset)
+        return SG_E_BOUNDS;
+    if (active == SG_SLOT_RAM)
+        return SG_E_STATE;
+    if (check.at && check.slot == SG_SLOT_RAM)
+        return SG_E_BUSY;
+    memcpy(trial + data->offset, data->data, data->length);
+    forget(SG_SLOT_RAM, SG_E_STATE);            // not checked since
+    return SG_OK;
+}
+
+void app_models_step(void)
+{
+    if (!check.at)
+        return;
+    const uint8_t *image = slot_image(check.slot);
+    const uint8_t space = slot_space(check.slot);
+    if (check.at < check.length) {
+        const uint16_t left = check.length - check.at;
+        const uint16_t n = left < PIECE_BYTES ? left : (uint16_t)PIECE_BYTES;
+        check.crc = sg_model_crc32_at(check.crc, image + check.at, n, space);
+        check.at += n;
+        return;
+    }
+    struct sg_model_view found;
+    memset(&found, 0, sizeof found);
+    const int8_t result = (int8_t)sg_model_open_checked(&found, image, slot_room(check.slot), space, check.crc);
+    // Flash cannot have changed since boot; what a verification finds there is only told.
+    if (check.slot == SG_SLOT_RAM && active != SG_SLOT_RAM) {
+        view[SG_SLOT_RAM] = found;
+        verdict[SG_SLOT_RAM] = result;
+    }
+    answer(result);
+}

@@ -1,0 +1,251 @@
+// SPDX-License-Identifier: Apache-2.0
+// Requests: one well-formed packet in, one answer out. No length from the line is trusted (PROTOCOL.md P3, P4).
+#include "app.h"
+
+#include <stddef.h>
+#include <string.h>
+
+enum { REBOOT_KEY = 0xA5, STREAM_ALL = SG_STREAM_RAW | SG_STREAM_GAZE | SG_STREAM_COUNTS };
+
+union body {                    // of a request, or of its answer
+    struct sg_status status;
+    struct sg_ping ping;
+    struct sg_pong pong;
+    struct sg_mode mode;
+    struct sg_infer infer;
+    struct sg_gaze gaze;
+    struct sg_model_info info;
+    struct sg_model_at at;
+    struct sg_model_data data;
+    struct sg_model_verdict verdict;
+    struct sg_exposure exposure;
+    struct sg_recentre recentre;
+    uint8_t bytes[SG_WIRE_BODY_MAX];
+};
+
+void app_refuse(uint8_t type, uint16_t seq, int8_t error)
+{
+    const struct sg_error body = { .error = error, .type = type };
+    app_count(&app.rx_rejected);
+    app_send(SG_MSG_ERROR, seq, &body, sizeof body, 0);
+}
+
+// Shortest body of a request, bytes; -1: there is no such request.
+static int8_t shortest(uint8_t type)
+{
+    switch (type) {
+    case SG_MSG_HELLO:
+    case SG_MSG_STATUS:
+    case SG_MSG_MODEL_INFO:
+        return 0;
+    case SG_MSG_PING:
+        return sizeof(struct sg_ping);
+    case SG_MSG_MODE:
+    case SG_MSG_TRIAL_USE:
+    case SG_MSG_REBOOT:
+    case SG_MSG_BAUD:
+        return sizeof(struct sg_mode);
+    case SG_MSG_INFER:
+        return sizeof(struct sg_infer);
+    case SG_MSG_MODEL_READ:
+    case SG_MSG_MODEL_VERIFY:
+        return sizeof(struct sg_model_at);
+    case SG_MSG_TRIAL_WRITE:
+        return offsetof(struct sg_model_data, data);
+    case SG_MSG_EXPOSURE:
+        return sizeof(struct sg_exposure);
+    case SG_MSG_RECENTRE:
+        return sizeof(struct sg_recentre);
+    default:
+        return -1;
+    }
+}
+
+static void status(struct sg_status *out)
+{
+    memset(out, 0, sizeof *out);
+    out->t_us = hal_now_us();
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+        out->exposure_us_q2[i] = sg_expose_to_us_q2(app.led[i].exposure_cycles);
+    out->boot_count = app_live_boots();
+    out->tx_dropped = app.tx_dropped;
+    const uint16_t bad = app.link.bad_crc + app.link.bad_length;
+    out->rx_bad = bad < app.link.bad_crc ? UINT16_MAX : bad;
+    out->rx_rejected = app.rx_rejected;
+    out->saturated = app.saturated;
+    out->starved = app.starved;
+    out->exposure_changes = app.exposure_changes;
+    out->stream = app.stream;
+    out->exposure_auto = app.exposure_auto;
+    out->active = app_model_slot();
+    hal_report(out);
+}
+
+static int8_t exposure(struct sg_exposure *body)
+{
+    uint16_t cycles[HAL_CHANNELS];
+    switch (body->op) {
+    case SG_EXPOSURE_GET:
+        break;
+    case SG_EXPOSURE_SET:
+        for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+            cycles[i] = app_exposure_limit(sg_expose_from_us_q2(body->exposure_us_q2[i]));
+            sg_expose_start(&app.led[i], cycles[i]);
+        }
+        hal_expose(cycles);
+        app.exposure_auto = 0;
+        break;
+    case SG_EXPOSURE_AUTO:
+        for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+            sg_expose_start(&app.led[i], app.led[i].exposure_cycles);
+        app.exposure_auto = 1;
+        break;
+    case SG_EXPOSURE_HOLD:
+        app.exposure_auto = 0;
+        break;
+    default:
+        return SG_E_ARG;
+    }
+    if (body->op != SG_EXPOSURE_GET)
+        app_live_keep_exposures();
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+        body->exposure_us_q2[i] = sg_expose_to_us_q2(app.led[i].exposure_cycles);
+    body->op = app.exposure_auto ? SG_EXPOSURE_AUTO : SG_EXPOSURE_HOLD;
+    body->reserved = 0;
+    return SG_OK;
+}
+
+static int8_t recentre(struct sg_recentre *body)
+{
+    if (body->op > SG_RECENTRE_CLEAR)
+        return SG_E_ARG;
+    if (body->op == SG_RECENTRE_SET && !app_model())
+        return SG_E_STATE;              // an offset belongs to a model
+    if (body->op == SG_RECENTRE_SET)
+        app_recentre_set(body->az_deg_q7, body->el_deg_q7);
+    else if (body->op == SG_RECENTRE_CLEAR)
+        app_recentre_set(0, 0);
+    const int16_t *now = app_recentre();
+    body->az_deg_q7 = now[0];
+    body->el_deg_q7 = now[1];
+    body->reserved = 0;
+    return SG_OK;
+}
+
+static void infer(union body *body)
+{
+    uint16_t feature[HAL_CHANNELS];
+    memcpy(feature, body->infer.feature, sizeof feature);
+    const uint8_t flags = app_model_slot() == SG_SLOT_RAM ? SG_FLAG_TRIAL : 0;
+    sg_track_infer(app_model(), feature, flags, app_recentre(), &body->gaze);
+}
+
+static int8_t trial_write(union body *body, uint8_t n)
+{
+    if (body->data.length > n - offsetof(struct sg_model_data, data))
+        return SG_E_SHORT;
+    const int8_t result = app_trial_write(&body->data);
+    // The answer's fields are the request's, in another order.
+    const struct sg_model_at at = { .offset = body->data.offset, .slot = body->data.slot,
+                                    .length = body->data.length };
+    body->at = at;
+    return result;
+}
+
+void app_request(const struct sg_head *head, const uint8_t *request, uint8_t n, uint32_t arrived_us)
+{
+    union body body;
+    uint8_t answer_bytes = 0;
+    int8_t result = SG_OK;
+    uint8_t answered = 0;               // later, by app_models_step()
+    const int8_t least = shortest(head->type);
+
+    if (least < 0 || n < (uint8_t)least) {
+        app_refuse(head->type, head->seq, least < 0 ? SG_E_UNKNOWN : SG_E_SHORT);
+        return;
+    }
+    memcpy(body.bytes, request, n);
+    switch (head->type) {
+    case SG_MSG_HELLO:
+        memcpy(body.bytes, &app.hello, sizeof app.hello);
+        answer_bytes = sizeof app.hello;
+        break;
+    case SG_MSG_STATUS:
+        status(&body.status);
+        answer_bytes = sizeof body.status;
+        break;
+    case SG_MSG_PING:
+        body.pong.rx_us = arrived_us;
+        body.pong.tx_us = hal_now_us();
+        answer_bytes = sizeof body.pong;
+        break;
+    case SG_MSG_MODE:
+        if (body.mode.mode & ~STREAM_ALL)
+            result = SG_E_ARG;
+        else
+            app.stream = body.mode.mode;
+        answer_bytes = sizeof body.mode;
+        break;
+    case SG_MSG_INFER:
+        infer(&body);
+        answer_bytes = sizeof body.gaze;
+        break;
+    case SG_MSG_MODEL_INFO:
+        app_model_info(&body.info);
+        answer_bytes = sizeof body.info;
+        break;
+    case SG_MSG_MODEL_READ: {
+        const struct sg_model_at at = body.at;
+        result = app_model_read(&at, &body.data);
+        answer_bytes = offsetof(struct sg_model_data, data) + at.length;
+        break;
+    }
+    case SG_MSG_MODEL_VERIFY:
+        result = app_model_verify(body.at.slot, head->seq);
+        answered = 1;
+        break;
+    case SG_MSG_TRIAL_WRITE:
+        result = trial_write(&body, n);
+        answer_bytes = sizeof body.at;
+        break;
+    case SG_MSG_TRIAL_USE:
+        if (body.mode.mode > 1)
+            result = SG_E_ARG;
+        else if (body.mode.mode == 1) {
+            result = app_trial_use(head->seq);
+            answered = 1;
+        } else {
+            result = app_trial_leave(&body.verdict);
+            answer_bytes = sizeof body.verdict;
+        }
+        break;
+    case SG_MSG_EXPOSURE:
+        result = exposure(&body.exposure);
+        answer_bytes = sizeof body.exposure;
+        break;
+    case SG_MSG_RECENTRE:
+        result = recentre(&body.recentre);
+        answer_bytes = sizeof body.recentre;
+        break;
+    case SG_MSG_REBOOT:
+        result = body.mode.mode == REBOOT_KEY ? SG_OK : SG_E_ARG;
+        answer_bytes = sizeof body.mode;
+        break;
+    case SG_MSG_BAUD:
+        result = body.mode.mode <= 1 ? SG_OK : SG_E_ARG;
+        answer_bytes = sizeof body.mode;
+        break;
+    }
+
+    if (result != SG_OK) {
+        app_refuse(head->type, head->seq, result);
+        return;
+    }
+    if (answered)
+        return;
+    app_send(head->type | SG_REPLY, head->seq, body.bytes, answer_bytes, 0);
+    if (head->type == SG_MSG_REBOOT)
+        hal_after_sending(HAL_AFTER_REBOOT);
+    if (head->type == SG_MSG_BAUD)
+        hal_after_sending(body.mode.mode ? HAL_AFTER_BAUD_500K : HAL_AFTER_BAUD_1M);
+}

@@ -1,0 +1,172 @@
+// SPDX-License-Identifier: Apache-2.0
+// The application: one frame's way from ADC codes to bytes on the line. It knows the core and hal.h and nothing of the
+// chip.
+#include "app.h"
+
+enum {
+    // Stream frames leave this much of the send queue to answers.
+    REPLY_RESERVE = SG_WIRE_FRAME_MAX,
+};
+
+struct app_state app;
+
+static uint16_t previous_exposure[HAL_CHANNELS];
+
+void app_count(uint16_t *counter)
+{
+    if (*counter != UINT16_MAX)
+        ++*counter;
+}
+
+uint16_t app_exposure_limit(uint16_t exposure_cycles)
+{
+    const uint16_t low = app.hello.exposure_min_us * (uint16_t)SG_EXPOSE_CYCLES_PER_US;
+    const uint16_t high = app.hello.exposure_max_us * (uint16_t)SG_EXPOSE_CYCLES_PER_US;
+    return exposure_cycles < low ? low : exposure_cycles > high ? high : exposure_cycles;
+}
+
+uint8_t app_send(uint8_t type, uint16_t seq, const void *body, uint8_t n, uint8_t keep_free)
+{
+    const struct sg_head head = { .seq = seq, .type = type, .flags = 0 };
+    uint8_t bytes[SG_WIRE_FRAME_MAX];
+    const int length = sg_wire_encode(&head, body, n, bytes);
+    return length > 0 && hal_send(bytes, (uint8_t)length, keep_free);
+}
+
+static void send_stream(uint8_t type, uint16_t seq, const void *body, uint8_t n)
+{
+    if (!app_send(type, seq, body, n, REPLY_RESERVE))
+        app_count(&app.tx_dropped);
+}
+
+// Compared with the frame before, as sensed: a change takes effect in the middle of a frame or one later.
+static uint8_t exposures_changed(const struct hal_frame *frame)
+{
+    uint8_t changed = 0;
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+        changed |= frame->exposure_cycles[i] != previous_exposure[i];
+        previous_exposure[i] = frame->exposure_cycles[i];
+    }
+    return changed ? SG_FLAG_EXPOSURE : 0;
+}
+
+static void expose_next(const struct hal_frame *frame)
+{
+    uint16_t exposure[HAL_CHANNELS];
+    uint8_t changed = 0;
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+        struct sg_expose_led *led = &app.led[i];
+        const uint16_t before = led->exposure_cycles;
+        sg_expose_step(led, frame->code[i], frame->exposure_cycles[i]);
+        led->exposure_cycles = app_exposure_limit(led->exposure_cycles);
+        exposure[i] = led->exposure_cycles;
+        if (before != exposure[i]) {
+            changed = 1;
+            app_count(&app.exposure_changes);
+        }
+    }
+    if (changed)
+        hal_expose(exposure);
+}
+
+static void count_readings(const struct hal_frame *frame)
+{
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+        if (frame->code[i] <= SG_EXPOSE_SATURATED_CODE)
+            app_count(&app.saturated);
+        if (frame->code[i] > 1024 - SG_EXPOSE_STARVED_LSB)
+            app_count(&app.starved);
+    }
+}
+
+static void stream(const struct hal_frame *frame, const struct sg_raw *raw, const struct sg_gaze *gaze)
+{
+    if (app.stream & SG_STREAM_RAW)
+        send_stream(SG_MSG_RAW, frame->seq, raw, sizeof *raw);
+    if (app.stream & SG_STREAM_GAZE)
+        send_stream(SG_MSG_GAZE, frame->seq, gaze, sizeof *gaze);
+    if (app.stream & SG_STREAM_COUNTS) {
+        struct sg_counts counts = { .t_us = frame->t_us };
+        for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+            counts.count[i] = frame->code[i];
+            counts.exposure_us_q2[i] = sg_expose_to_us_q2(frame->exposure_cycles[i]);
+        }
+        send_stream(SG_MSG_COUNTS, frame->seq, &counts, sizeof counts);
+    }
+}
+
+void app_on_frame(const struct hal_frame *frame)
+{
+    const struct sg_model_view *model = app_model();
+    const int16_t *recentre = app_recentre();
+    struct sg_raw raw = { .t_us = frame->t_us, .span_us = frame->span_us };
+    struct sg_gaze gaze;
+
+    HAL_BEGIN(HAL_SECTION_FRAME);
+    HAL_BEGIN(HAL_SECTION_FEATURE);
+    raw.flags = sg_track_features(frame->code, frame->exposure_cycles, raw.feature);
+    HAL_END(HAL_SECTION_FEATURE);
+    raw.flags |= exposures_changed(frame);
+    if (app_model_slot() == SG_SLOT_RAM)
+        raw.flags |= SG_FLAG_TRIAL;
+    raw.model_crc = model ? model->crc : 0;
+    raw.recentre_az_deg_q7 = recentre[0];
+    raw.recentre_el_deg_q7 = recentre[1];
+
+    HAL_BEGIN(HAL_SECTION_INFER);
+    sg_track_infer(model, raw.feature, raw.flags, recentre, &gaze);
+    HAL_END(HAL_SECTION_INFER);
+    gaze.t_us = raw.t_us;
+    gaze.infer_us = (uint16_t)(hal_now_us() - (raw.t_us + raw.span_us));
+
+    HAL_BEGIN(HAL_SECTION_OUTPUT);
+    stream(frame, &raw, &gaze);
+    HAL_END(HAL_SECTION_OUTPUT);
+
+    if (raw.flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED))
+        count_readings(frame);
+    if (app.exposure_auto)
+        expose_next(frame);
+    app_live_frame();
+    HAL_END(HAL_SECTION_FRAME);
+}
+
+void app_on_byte(uint8_t byte, uint32_t zero_us)
+{
+    static uint8_t body[SG_WIRE_BODY_MAX];
+    struct sg_head head;
+    const int n = sg_link_receive(&app.link, byte, &head, body);
+    if (n >= 0)
+        app_request(&head, body, (uint8_t)n, zero_us);
+}
+
+static void describe(struct sg_hello *hello)
+{
+    hal_describe(hello);
+    hello->firmware = APP_FIRMWARE_VERSION;
+    hello->wire_version = SG_WIRE_VERSION;
+    hello->model_version = SG_MODEL_VERSION;
+    hello->trial_bytes = HAL_TRIAL_BYTES;
+    hello->channels = HAL_CHANNELS;
+}
+
+int main(void)
+{
+    uint16_t exposure[HAL_CHANNELS];
+
+    hal_boot();
+    describe(&app.hello);
+    app_models_start();
+    app_live_start();
+    app_live_exposures(exposure, &app.exposure_auto);
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+        sg_expose_start(&app.led[i], app_exposure_limit(exposure[i]));
+        exposure[i] = app.led[i].exposure_cycles;
+    }
+    hal_start(exposure);
+    while (hal_poll()) {
+        app_models_step();
+        app_live_step();
+    }
+    return 0;
+}

@@ -1,0 +1,105 @@
+// SPDX-License-Identifier: Apache-2.0
+// What happens before main: why the chip was reset, the watchdog off, the stack painted.
+#include "port.h"
+
+#include <avr/pgmspace.h>
+#include <avr/wdt.h>
+
+enum {
+    PAINT = 0xC5,
+    BOOTLOADER_VERSION_AT = 0x7FFE,     // Optiboot leaves minor, major here; other bootloaders leave FF FF
+    OPTIBOOT_KEEPS_CAUSE = 0x0406,      // from 4.6 on MCUSR is handed over in r2
+};
+#define ALIVE_SIGNATURE 0x5A47315AUL    // survives every reset but loss of power
+
+static uint32_t alive __attribute__((section(".noinit")));
+static uint8_t left_mcusr __attribute__((section(".noinit")));
+static uint8_t left_r2 __attribute__((section(".noinit")));
+static uint8_t left_uart __attribute__((section(".noinit")));
+static uint8_t cause;
+
+extern uint8_t __heap_start;    // first byte after all static data
+
+// Before anything else uses registers or stack. A watchdog reset leaves the watchdog running at 16 ms: off at once.
+void boot_first(void) __attribute__((naked, used, section(".init3")));
+void boot_first(void)
+{
+    __asm__ volatile("sts %0, r2" : : "i"(&left_r2));
+    left_mcusr = MCUSR;
+    left_uart = UCSR0B;
+    MCUSR = 0;
+    __asm__ volatile("wdr");
+    WDTCSR = (1 << WDCE) | (1 << WDE);
+    WDTCSR = 0;
+    for (uint8_t *p = &__heap_start; p <= (uint8_t *)RAMEND; p++)
+        *p = PAINT;
+}
+
+// MCUSR says it when the bootloader left it alone. Optiboot before 4.6 clears it: then a UART that is switched on means
+// that the bootloader held a session (it does so only after an external reset), a lost signature means that
+// power was off, and what remains is the watchdog.
+static uint8_t find_cause(void)
+{
+    const uint8_t known = SG_RESET_POWER | SG_RESET_EXTERNAL | SG_RESET_BROWNOUT | SG_RESET_WATCHDOG;
+    const uint16_t version = pgm_read_word(BOOTLOADER_VERSION_AT);
+    if (left_mcusr & known)
+        return left_mcusr & known;
+    if (version >= OPTIBOOT_KEEPS_CAUSE && version != 0xFFFF && (left_r2 & known))
+        return left_r2 & known;
+    if (alive != ALIVE_SIGNATURE)
+        return SG_RESET_POWER;
+    return left_uart ? SG_RESET_EXTERNAL : SG_RESET_WATCHDOG;
+}
+
+void hal_boot(void)
+{
+    cli();
+    // The bits of MCUSR are those of enum sg_reset.
+    _Static_assert((1 << PORF) == SG_RESET_POWER && (1 << EXTRF) == SG_RESET_EXTERNAL
+                   && (1 << BORF) == SG_RESET_BROWNOUT && (1 << WDRF) == SG_RESET_WATCHDOG, "reset bits");
+    cause = find_cause();
+    alive = ALIVE_SIGNATURE;
+    // Boot loaders blink an LED on D13 (PB5): back to an input.
+    PORTB = 0;
+    DDRB = 0;
+}
+
+uint8_t boot_reset_cause(void)
+{
+    return cause;
+}
+
+uint16_t boot_stack_free(void)
+{
+    const uint8_t *p = &__heap_start;
+    while (p <= (const uint8_t *)RAMEND && *p == PAINT)
+        p++;
+    return (uint16_t)(p - &__heap_start);
+}
+
+void boot_watchdog_on(void)
+{
+    wdt_enable(WDTO_120MS);
+}
+
+_Noreturn void boot_restart(void)
+{
+    cli();
+    DDRC = 0;
+    DDRD = 0;
+    PORTC = 0;
+    PORTD = 0;
+    if (pgm_read_word(BOOTLOADER_VERSION_AT) == 0xFFFF) {
+        // The older bootloader never switches the watchdog off and would be reset by it for ever: start the
+        // application afresh instead. find_cause() takes the silent UART for the watchdog.
+        wdt_disable();
+        UCSR0B = 0;
+        TIMSK1 = 0;
+        ADCSRA = 0;
+        TCCR1B = 0;
+        __asm__ volatile("jmp 0");
+    }
+    wdt_enable(WDTO_15MS);
+    for (;;) {
+    }
+}

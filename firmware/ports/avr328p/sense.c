@@ -1,0 +1,257 @@
+// SPDX-License-Identifier: Apache-2.0
+// The sensing engine: LED i senses while the other five emit, six slots of 600 us a frame, all in interrupts.
+//
+//   slot + 0      OCR1A    the other five light; ~5 us later the charged cathode is released, the release instant is
+//                          read from TCNT1, and OCR1B is set to release + exposure
+//   + exposure    OCR1B    hardware starts the ADC; sample-and-hold closes 256 cycles later. No code is involved
+//   + 8 cycles    OCR1A    lights out; the next LED's cathode is driven high
+//   + 92 us       ADC      code read; a throw-away conversion of the next channel charges the sample capacitor
+//                          to Vcc through that cathode
+// An interrupt that comes late moves the release and, with it, the sample: never the exposure.
+#include "port.h"
+
+enum {
+    LED_FIRST_ANODE = 2,            // anodes on PD2..PD7, cathodes on PC0..PC5
+    PORTD_DARK = 1 << PD0,          // pull-up on the UART's input
+    DDRD_ALL = 0xFC,
+    DDRC_ALL = 0x3F,
+    // OCR1B match to the closing of sample-and-hold: two ADC clocks of 128 cycles after a trigger.
+    SAMPLE_CYCLES = 256,
+    // Release (the OUT to PORTC) to the TCNT1 value that the LDS after it returns.
+    RELEASE_READ_CYCLES = 1,
+    EXPOSURE_FIXED_CYCLES = SAMPLE_CYCLES + RELEASE_READ_CYCLES,
+    LIGHTS_OUT_MARGIN_CYCLES = 8,
+    SETTLE_CYCLES = 5 * CYCLES_PER_US - 42,     // 42: from the light to the release without the delay
+    LATE_CYCLES = 40 * CYCLES_PER_US,
+    SOON_CYCLES = 64,               // a compare value nearer than this may be missed
+    ADC_ON = (1 << ADEN) | (1 << ADPS2) | (1 << ADPS1) | (1 << ADPS0),
+    ADC_ARMED = ADC_ON | (1 << ADATE) | (1 << ADIE) | (1 << ADIF),
+    ADC_PRECHARGE = ADC_ON | (1 << ADSC),
+    ADMUX_AVCC = 1 << REFS0,
+};
+_Static_assert(EXPOSURE_MIN_CYCLES > EXPOSURE_FIXED_CYCLES + SOON_CYCLES, "the trigger must lie ahead");
+_Static_assert(5 * CYCLES_PER_US + EXPOSURE_MAX_CYCLES + 6 * CYCLES_PER_US < SLOT_CYCLES / 2, "lit at most half");
+
+struct slot {
+    uint16_t release;               // TCNT1
+    uint16_t exposure_cycles;
+    uint16_t code;
+};
+
+struct raw_frame {
+    struct slot slot[HAL_CHANNELS];
+    uint32_t overflows;             // of TCNT1, at the first release
+    uint16_t seq;
+};
+
+static struct raw_frame buffer[2];
+static struct slot *filling;                    // slot of the frame being sensed
+static uint8_t filling_buffer;
+static volatile uint8_t ready;                  // 1 + index of a complete frame; 0: none
+static uint8_t led;                             // sensing now
+static uint8_t exposing;                        // between release and sample
+static uint16_t slot_start;                     // TCNT1 at which the slot's light goes on
+static uint16_t trigger_cycles[HAL_CHANNELS];   // release to OCR1B
+static volatile uint32_t overflows;
+static volatile uint32_t frames;
+static volatile uint16_t late_frames;
+static volatile uint16_t late_slots;
+
+static const uint8_t led_bit[HAL_CHANNELS] = { 1, 2, 4, 8, 16, 32 };
+
+ISR(TIMER1_OVF_vect)
+{
+    overflows++;
+}
+
+// Call with interrupts off. The overflow that came after interrupts went off is pending, not counted.
+static uint32_t overflows_at(uint16_t ticks)
+{
+    return overflows + ((TIFR1 & (1 << TOV1)) && ticks < 0x8000U);
+}
+
+static inline __attribute__((always_inline)) void light_and_release(void)
+{
+    const uint8_t bit = led_bit[led];
+    PORTD = PORTD_DARK | (uint8_t)(DDRD_ALL & ~(bit << LED_FIRST_ANODE));
+
+    const uint16_t now = TCNT1;
+    if ((uint16_t)(now - slot_start) > LATE_CYCLES)
+        late_slots++;
+    TIFR1 = 1 << OCF1B;             // the trigger is an edge of this flag: it must be down
+    ADCSRA = ADC_ARMED;
+    const uint16_t trigger = trigger_cycles[led];
+    const uint8_t ddrc = DDRC_ALL & ~bit;
+    __builtin_avr_delay_cycles(SETTLE_CYCLES);
+
+    // The pull-up is on for the one cycle between the two: the node is at Vcc anyway.
+    uint16_t release;
+    __asm__ volatile("out %[ddr], %[mask]" "\n\t"
+                     "out %[port], __zero_reg__" "\n\t"
+                     "lds %A[ticks], %[low]" "\n\t"
+                     "lds %B[ticks], %[high]"
+                     : [ticks] "=&r"(release)
+                     : [ddr] "I"(_SFR_IO_ADDR(DDRC)), [port] "I"(_SFR_IO_ADDR(PORTC)), [mask] "r"(ddrc),
+                       [low] "i"(_SFR_MEM_ADDR(TCNT1L)), [high] "i"(_SFR_MEM_ADDR(TCNT1H)));
+    const uint16_t match = release + trigger;
+    OCR1B = match;
+    OCR1A = match + (SAMPLE_CYCLES + LIGHTS_OUT_MARGIN_CYCLES);
+    exposing = 1;
+
+    filling->release = release;
+    filling->exposure_cycles = trigger + EXPOSURE_FIXED_CYCLES;
+    if (led == 0) {
+        GPIOR1 = 1;
+        buffer[filling_buffer].overflows = overflows_at(release);
+    }
+}
+
+static inline __attribute__((always_inline)) void lights_out(void)
+{
+    PORTD = PORTD_DARK;
+    DDRC = DDRC_ALL;
+    PORTC = led == HAL_CHANNELS - 1 ? 1 : (uint8_t)(led_bit[led] << 1);
+    exposing = 0;
+
+    slot_start += SLOT_CYCLES;
+    if ((int16_t)(slot_start - TCNT1) < SOON_CYCLES) {
+        slot_start = TCNT1 + SOON_CYCLES;
+        late_slots++;
+    }
+    OCR1A = slot_start;
+}
+
+ISR(TIMER1_COMPA_vect)
+{
+    HAL_BEGIN(HAL_SECTION_SENSE);
+    if (exposing) {
+        lights_out();
+    } else if (ADCSRA & (1 << ADSC)) {
+        // Only after a slot that began more than 100 us late: the sample capacitor is not charged yet.
+        slot_start += 8 * 16 * CYCLES_PER_US;
+        OCR1A = slot_start;
+        late_slots++;
+    } else {
+        light_and_release();
+    }
+    HAL_END(HAL_SECTION_SENSE);
+}
+
+ISR(ADC_vect)
+{
+    HAL_BEGIN(HAL_SECTION_SENSE);
+    filling->code = ADC;
+    filling++;
+    if (++led == HAL_CHANNELS) {
+        GPIOR1 = 2;
+        led = 0;
+        buffer[filling_buffer].seq = (uint16_t)frames++;
+        if (ready)
+            late_frames++;      // the one that waited was never taken
+        ready = 1 + filling_buffer;
+        filling_buffer = !filling_buffer;
+        filling = buffer[filling_buffer].slot;
+    }
+    ADMUX = ADMUX_AVCC | led;
+    ADCSRA = ADC_PRECHARGE;
+    HAL_END(HAL_SECTION_SENSE);
+}
+
+void hal_expose(const uint16_t exposure_cycles[HAL_CHANNELS])
+{
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+        uint16_t cycles = exposure_cycles[i];
+        if (cycles < EXPOSURE_MIN_CYCLES)
+            cycles = EXPOSURE_MIN_CYCLES;
+        if (cycles > EXPOSURE_MAX_CYCLES)
+            cycles = EXPOSURE_MAX_CYCLES;
+        cycles -= EXPOSURE_FIXED_CYCLES;
+        ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+            trigger_cycles[i] = cycles;
+        }
+    }
+}
+
+void sense_start(const uint16_t exposure_cycles[HAL_CHANNELS])
+{
+    hal_expose(exposure_cycles);
+    PORTD = PORTD_DARK;
+    DDRD = DDRD_ALL;
+    DDRC = DDRC_ALL;
+    PORTC = led_bit[0];
+    DIDR0 = DDRC_ALL;               // the cathodes are analog
+
+    filling = buffer[0].slot;
+    ADMUX = ADMUX_AVCC;
+    ADCSRB = (1 << ADTS2) | (1 << ADTS0);   // Timer1 compare match B
+    ADCSRA = ADC_PRECHARGE;
+
+    TCCR1A = 0;
+    TCCR1B = 0;
+    TCNT1 = 0;
+    slot_start = SLOT_CYCLES;       // the first conversion takes 25 ADC clocks, 200 us
+    OCR1A = SLOT_CYCLES;
+    TIFR1 = (1 << TOV1) | (1 << OCF1A) | (1 << OCF1B);
+    TIMSK1 = (1 << OCIE1A) | (1 << TOIE1);
+    TCCR1B = 1 << CS10;
+}
+
+uint32_t hal_now_us(void)
+{
+    uint32_t high;
+    uint16_t ticks;
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+        ticks = TCNT1;
+        high = overflows_at(ticks);
+    }
+    return (high << 12) | (ticks >> 4);
+}
+
+uint8_t sense_take(struct hal_frame *frame)
+{
+    uint32_t start_overflows;
+    uint16_t first, last = 0, sum_half_cycles = 0;
+    uint32_t sum_cycles = 0;
+
+    if (!ready)
+        return 0;
+    ATOMIC_BLOCK(ATOMIC_FORCEON) {      // ~15 us: within what the UART's two-byte buffer bridges at 1 Mbaud
+        const struct raw_frame *raw = &buffer[ready - 1];
+        first = raw->slot[0].release;
+        for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+            frame->code[i] = raw->slot[i].code;
+            frame->exposure_cycles[i] = raw->slot[i].exposure_cycles;
+            last = raw->slot[i].release - first;
+            sum_cycles += last;
+        }
+        start_overflows = raw->overflows;
+        frame->seq = raw->seq;
+        ready = 0;
+    }
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+        sum_half_cycles += frame->exposure_cycles[i] >> 1;
+    last += frame->exposure_cycles[HAL_CHANNELS - 1];
+    sum_cycles += sum_half_cycles;
+    // sum / 6, as (sum / 2) * 21846 / 2^16: at most two cycles too much for frames below 3600 us, and 32 bits hold it.
+    const uint16_t mean = (uint16_t)(((sum_cycles >> 1) * 21846UL) >> 16);
+    const uint32_t first_us = (start_overflows << 12) | (first >> 4);
+    frame->t_us = first_us + ((mean + (first & 15U) + 8U) >> 4);
+    frame->span_us = (uint16_t)(last - mean + 8U) >> 4;
+    return 1;
+}
+
+void sense_taken(void)
+{
+    ATOMIC_BLOCK(ATOMIC_FORCEON) {
+        late_frames += ready != 0;
+    }
+}
+
+void sense_report(struct sg_status *status)
+{
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+        status->frames = frames;
+        status->late_slots = late_slots;
+        status->late_frames = late_frames;
+    }
+}
