@@ -13,7 +13,7 @@
 //   k_i  = exp(-T_i / (16 u^2))                                    Q0.16, 0 from T_i >= 2^20; see below
 //   gaze = bias + sum_j trend_j * s_j + sum_i weight_i * k_i       32-bit, 2^-(weight_frac_bits + 16) deg
 // where u = sqrt(4096 / ln 2), so that T >> 16 is a whole number of halvings. k is interpolated in a table:
-//   level[i] = min(round(2^(16 - i/64)), 65535),  i = T >> 10
+//   level[i] = floor(2^(16 - i/64) * (1 - (ln 2 / 64)^2 / 16)),  i = T >> 10
 //   k        = level[i] - ((((level[i] - level[i + 1]) << 6) * (T & 1023)) >> 16)
 // Equation: GP mean k^T C^-1 u of the paper (section 5.2), distilled to n vectors with a linear trend;
 // DESIGN.md section 5.
