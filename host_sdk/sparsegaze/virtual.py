@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A virtual Nano: the simulator program of tools/vheadset, started, registered and cleaned up.
+
+    with VirtualNano(person=3, unpaced=True) as nano:
+        with Device(nano.port) as device:
+            ...
+"""
+
+import json
+import os
+import select
+import shutil
+import subprocess
+import tempfile
+import time
+import weakref
+from pathlib import Path
+
+from . import registry
+from .control import EyeState, Section, Time, VirtualControl
+from .errors import VirtualError
+
+try:
+    import tomllib
+except ImportError:             # Python < 3.11
+    import tomli as tomllib
+
+__all__ = ["VirtualNano", "VirtualControl", "EyeState", "Section", "Time", "locate_vheadset", "locate_bootloader"]
+
+SOURCE_TREE = Path(__file__).resolve().parent.parent.parent
+BOOTLOADERS = {                 # name: (start address, file, variable that names another file)
+    "optiboot": (0x7E00, "optiboot/optiboot_atmega328.hex", "SPARSEGAZE_OPTIBOOT"),
+    "atmegaboot": (0x7800, "atmega/ATmegaBOOT_168_atmega328.hex", "SPARSEGAZE_ATMEGABOOT"),
+}
+BOOTLOADER_FOLDERS = (
+    "/usr/share/arduino/hardware/arduino/avr/bootloaders",
+    "/usr/local/share/arduino/hardware/arduino/avr/bootloaders",
+    "~/.arduino15/packages/arduino/hardware/avr",
+)
+READY_TIMEOUT_S = 30.0
+STOP_TIMEOUT_S = 5.0
+
+
+class VirtualNano:
+    """Starts on construction; a context manager that stops it on leaving.
+
+    headset     path of a headset description (default: the LED2Gaze ring)
+    person      seed of the simulated person
+    seed        of parts, noise and behaviour; default: the person's
+    unpaced     False: real time; True: its clock stands still except while a client lets it run
+    auto_reset  False: a board whose reset trace is cut: opening the port does not reset it
+    bootloader  "optiboot", "atmegaboot", or a path (then bootloader_start is its address)
+    app         .hex or .elf that is in flash already
+    state_dir   keeps flash and EEPROM between runs; default: a fresh one, removed at the end
+    ambient     "dark", "room", "bright_room", "sun_gap";  light: "nominal", "dim", "bright"
+    map         path of a response map (.sgmap) to use instead of simulating headset and person
+    link        symbolic link to make to the port;  truth: CSV to write the eye's true state to
+    physics     {"section.key": value} over the constants of physics.toml
+    progress    handed to the response map's computation
+
+    port, control (VirtualControl), pid, entry (registry.Entry)
+    Raises VirtualError.
+    """
+
+    def __init__(self, headset=None, person=1, seed=None, unpaced=False, auto_reset=True, bootloader="optiboot",
+                 bootloader_start=None, app=None, state_dir=None, ambient="dark", light="nominal", map=None, link=None,
+                 truth=None, physics=None, progress=None):
+        binary = locate_vheadset()
+        start, boot_hex = locate_bootloader(bootloader, bootloader_start)
+        headset = Path(headset) if headset is not None else SOURCE_TREE / "headsets" / "led2gaze.toml"
+        drawn = None
+        if map is None:
+            map, drawn = _response_map(headset, person, progress)
+        # Short and private: a socket's path holds 107 bytes.
+        folder = Path(tempfile.mkdtemp(prefix="sgv-"))
+        self._finalizer = weakref.finalize(self, _clean, folder)
+        state = Path(state_dir) if state_dir is not None else folder / "state"
+        state.mkdir(parents=True, exist_ok=True)
+        control = folder / "control"
+        settings = {
+            "bootloader": _absolute(boot_hex), "bootloader_start": f"0x{start:04X}", "state": _absolute(state),
+            "map": _absolute(map), "seed": int(person if seed is None else seed), "unpaced": int(bool(unpaced)),
+            "auto_reset": int(bool(auto_reset)), "control": control, "ambient": ambient, "light": light,
+        }
+        for key, path in (("app", app), ("link", link), ("truth", truth)):
+            if path is not None:
+                settings[key] = _absolute(path)
+        pupil = getattr(drawn, "pupil_mm", None)
+        if pupil is not None:
+            settings["pupil_mean_mm"] = f"{float(pupil):.6f}"
+        settings.update(_physics(binary, physics or {}))
+        config = folder / "config"
+        config.write_text("".join(f"{key} {value}\n" for key, value in settings.items()))
+        self._process, ready = _start(binary, config, folder / "errors")
+        self._finalizer.detach()
+        self._finalizer = weakref.finalize(self, _end, self._process, folder)
+        self.port = ready["port"]
+        self.pid = self._process.pid
+        self.control = VirtualControl(ready.get("control", str(control)))
+        self.entry = registry.Entry(self.port, None if link is None else _absolute(link), self.control.path, self.pid,
+                                    bool(unpaced), settings["seed"], int(person), os.fspath(headset), bool(auto_reset))
+        registry.register(self.entry)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        self.stop()
+
+    @property
+    def alive(self):
+        return self._process.poll() is None
+
+    def wait(self, timeout_s=None):
+        """Until the simulator ends by itself. Returns its exit code, or None when it still runs after `timeout_s`."""
+        try:
+            return self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return None
+
+    def kill(self):
+        """End it at once, as a pulled cable would."""
+        self._process.kill()
+        self._process.wait()
+        registry.unregister(self.pid)
+
+    def stop(self):
+        """End it, saving flash and EEPROM; remove what was temporary."""
+        self.control.close()
+        self._finalizer()
+
+
+def locate_vheadset():
+    """Path of the simulator program: $SPARSEGAZE_VHEADSET, or the source tree's, built when it is not there yet."""
+    named = os.environ.get("SPARSEGAZE_VHEADSET")
+    if named:
+        if not os.access(named, os.X_OK):
+            raise VirtualError(f"SPARSEGAZE_VHEADSET names {named}, which is not a program", "correct or unset it")
+        return Path(named)
+    folder = SOURCE_TREE / "tools" / "vheadset"
+    binary = folder / "vheadset"
+    if binary.is_file():
+        return binary
+    if not (folder / "Makefile").is_file():
+        raise VirtualError("the virtual Nano is not part of this installation",
+                           "use a source tree of sparsegaze, or set SPARSEGAZE_VHEADSET to its program")
+    try:
+        built = subprocess.run(["make", "-C", str(folder)], capture_output=True, text=True)
+    except OSError as error:
+        raise VirtualError(f"the virtual Nano cannot be built ({error.strerror}: make)", "run `make setup`") from None
+    if built.returncode or not binary.is_file():
+        reason = next((line for line in built.stderr.splitlines() if "rror" in line), "make failed")
+        raise VirtualError(f"the virtual Nano cannot be built ({reason.strip()})", "run `make setup`")
+    return binary
+
+
+def locate_bootloader(name="optiboot", start=None):
+    """(start address, path) of a stock bootloader by name, or of a hex file given by path."""
+    key = os.fspath(name).lower()
+    if key not in BOOTLOADERS:
+        if not os.path.isfile(name):
+            raise VirtualError(f"no such bootloader: {name}", f"give {' or '.join(BOOTLOADERS)}, or a hex file")
+        return (0x7E00 if start is None else int(start)), Path(name)
+    address, relative, variable = BOOTLOADERS[key]
+    named = os.environ.get(variable)
+    if named:
+        if not os.path.isfile(named):
+            raise VirtualError(f"{variable} names {named}, which does not exist", "correct or unset it")
+        return address, Path(named)
+    for folder in BOOTLOADER_FOLDERS:
+        base = Path(folder).expanduser()
+        for path in [base / relative] + sorted(base.glob(f"*/bootloaders/{relative}")):
+            if path.is_file():
+                return address, path
+    raise VirtualError(f"the stock bootloader {relative} is not installed",
+                       f"`apt-get install arduino-core-avr`, or set {variable} to the file")
+
+
+def _response_map(headset, person, progress):
+    from .headset import load_headset
+    from .person import draw_person
+    from .simulate import response_map
+
+    drawn = draw_person(person)
+    return response_map(load_headset(headset), drawn, progress=progress), drawn
+
+
+def _physics(binary, changes):
+    path = binary.parent / "physics.toml"
+    if not path.is_file():
+        path = SOURCE_TREE / "tools" / "vheadset" / "physics.toml"
+    try:
+        sections = tomllib.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise VirtualError(f"cannot read {path} ({error})", "check the source tree out again") from None
+    flat = {f"{section}.{key}": value for section, values in sections.items() for key, value in values.items()}
+    unknown = sorted(set(changes) - set(flat))
+    if unknown:
+        raise VirtualError(f"there is no physical constant {unknown[0]}", f"see {path.name}")
+    flat.update(changes)
+    return flat
+
+
+def _start(binary, config, errors):
+    """Start the simulator, wait for its ready line. Returns (process, parsed line)."""
+    with open(errors, "wb") as stderr:
+        try:
+            process = subprocess.Popen([str(binary), "--config", str(config)], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                                       stderr=stderr, start_new_session=True)
+        except OSError as error:
+            raise VirtualError(f"cannot start {binary} ({error.strerror})", "build it again: `make -C tools/vheadset`") from None
+    line, deadline = b"", time.monotonic() + READY_TIMEOUT_S
+    while not line.endswith(b"\n"):
+        ready, _, _ = select.select([process.stdout], [], [], max(0.0, deadline - time.monotonic()))
+        part = os.read(process.stdout.fileno(), 4096) if ready else b""
+        if not part:
+            process.kill()
+            process.wait()
+            process.stdout.close()
+            reason = errors.read_text(errors="replace").strip().splitlines()
+            raise VirtualError("the virtual Nano did not start: " + (reason[0] if reason else
+                               "it ended without a word" if ready else f"not ready after {READY_TIMEOUT_S:g} s"),
+                               "`sparsegaze doctor` shows what is missing")
+        line += part
+    try:
+        parsed = json.loads(line)
+        parsed["port"]
+    except (ValueError, KeyError, TypeError):
+        process.kill()
+        process.wait()
+        raise VirtualError(f"the virtual Nano said {line[:80]!r} instead of its port", "build it again: `make -C tools/vheadset`") from None
+    return process, parsed
+
+
+def _end(process, folder):
+    registry.unregister(process.pid)
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+    if process.stdout is not None:
+        process.stdout.close()
+    _clean(folder)
+
+
+def _clean(folder):
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _absolute(path):
+    text = os.path.abspath(os.fspath(path))
+    if "\n" in text or "#" in text:
+        raise VirtualError(f"the virtual Nano cannot take the path {text!r}", "use one without '#' or line breaks")
+    return text
