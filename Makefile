@@ -15,40 +15,47 @@ ARGS ?=
 PY := .venv/bin/python
 SDK := host_sdk/sparsegaze
 HEX := $(SDK)/data/firmware.hex
+PIO := .pio/build/nano
+BINUTILS := .pio-offline/packages/toolchain-atmelavr/bin
 STARTED := $(shell date +%s.%N)
+
+# The command $(1), which speaks only when it fails.
+quietly = echo "$(1)"; { $(1); } >build/native/log 2>&1 || { cat build/native/log >&2; exit 1; }
+# $(1) over $(2) when it differs, at one stroke because somebody may be reading; then the command $(3).
+refresh = cmp -s $(1) $(2) || { cp $(1) $(2).new && mv $(2).new $(2) && $(if $(3),$(3),:); }
 
 .PHONY: help setup firmware native demo test check size lock clean distclean
 
 help: ## this list
-	@sed -n 's/^\([a-z]*\):[^#]*## \(.*\)/  make \1#\2/p' $(MAKEFILE_LIST) | awk -F'#' '{ printf "%-18s%s\n", $$1, $$2 }'
+	@sed -n 's/^\([a-z]*\):[^#]*## \(.*\)/  make \1#\2/p' $(MAKEFILE_LIST) | \
+	    awk -F'#' '{ printf "%-18s%s\n", $$1, $$2 }'
 
 setup: ## install what is missing: Debian packages (when root or sudo), .venv with pinned packages
 	@sh tools/setup.sh
 
-firmware: setup ## build the Nano's firmware with PlatformIO, check its link, put the hex into the Python package
+firmware: setup ## build the Nano's firmware, check its link, put the hex into the Python package
 	@$(PY) tools/pio_offline.py run -s -e nano
-	@$(PY) tools/check_link.py .pio/build/nano/firmware.elf
+	@$(PY) tools/check_link.py $(PIO)/firmware.elf
 	@mkdir -p build/firmware $(dir $(HEX))
-	@for f in firmware.elf firmware.hex; do \
-	    cmp -s .pio/build/nano/$$f build/firmware/$$f || { \
-	        cp .pio/build/nano/$$f build/firmware/$$f.new && mv build/firmware/$$f.new build/firmware/$$f; }; done
-	@cmp -s build/firmware/firmware.hex $(HEX) || { cp build/firmware/firmware.hex $(HEX).new && mv $(HEX).new $(HEX) && \
-	    echo "$(HEX) changed: commit it together with the sources"; }
+	@$(call refresh,$(PIO)/firmware.elf,build/firmware/firmware.elf)
+	@$(call refresh,$(PIO)/firmware.hex,build/firmware/firmware.hex)
+	@$(call refresh,$(PIO)/firmware.hex,$(HEX),echo "$(HEX) changed: commit it together with the sources")
 
-native: setup build/native/core build/native/sim ## build what runs on this computer: core and simulator for Python, virtual Nano
+native: setup build/native/core build/native/sim ## build what runs here: core, simulator, virtual Nano
 	@$(MAKE) --no-print-directory -C tools/vheadset
 
-build/native/core: $(wildcard firmware/core/*.[ch] $(SDK)/_core_build.py $(SDK)/_core_batch.c) .venv/setup-stamp
-	$(PY) $(SDK)/_core_build.py >build/native.log 2>&1 || { cat build/native.log >&2; exit 1; }
-	@mkdir -p $(dir $@) && touch $@
+# setup has built the core too, under setuptools' name for it: only one may stay, the other gets stale.
+build/native/core: $(wildcard firmware/core/*.[ch] $(SDK)/_core_b*.[pc]*) .venv/setup-stamp
+	@mkdir -p $(dir $@)
+	@$(call quietly,$(PY) $(SDK)/_core_build.py) && rm -f $(SDK)/_core.abi3.so && touch $@
 
 build/native/sim: $(wildcard sim_c/*.[ch] $(SDK)/_sim_build.py) .venv/setup-stamp
-	$(PY) $(SDK)/_sim_build.py >build/native.log 2>&1 || { cat build/native.log >&2; exit 1; }
-	@mkdir -p $(dir $@) && touch $@
+	@mkdir -p $(dir $@)
+	@$(call quietly,$(PY) $(SDK)/_sim_build.py) && touch $@
 
 .venv/setup-stamp: | setup
 
-demo: setup firmware native ## the whole main job on a virtual Nano; SEED=k draws another person, parts and noise
+demo: setup firmware native ## the whole main job on a virtual Nano; SEED=k draws another person
 	@$(PY) tools/demo.py --seed $(SEED) --started $(STARTED) $(ARGS)
 
 test: setup firmware native ## every test; ARGS="-k name" for some
@@ -59,8 +66,8 @@ check: firmware ## the quick static checks: includes, licences, packaging, link
 	@$(PY) -m pytest -q tests/build $(ARGS)
 
 size: firmware ## flash and SRAM that the firmware takes, by section and by largest symbol
-	@.pio-offline/packages/toolchain-atmelavr/bin/avr-size -A -d build/firmware/firmware.elf
-	@.pio-offline/packages/toolchain-atmelavr/bin/avr-nm -S --size-sort -r -t d build/firmware/firmware.elf | head -n 20
+	@$(BINUTILS)/avr-size -A -d build/firmware/firmware.elf
+	@$(BINUTILS)/avr-nm -S --size-sort -r -t d build/firmware/firmware.elf | head -n 20
 
 lock: ## write requirements.txt anew from requirements.in, with hashes
 	@python3 -m venv build/lock && build/lock/bin/pip install -qq uv

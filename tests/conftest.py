@@ -21,7 +21,7 @@ def repo_root():
 
 @pytest.fixture(scope="session")
 def shared_dir():
-    """The folder shared/ beside the work tree, where the project's agreed constants live; skips where there is none."""
+    """The folder shared/ beside the work tree, with the project's constants; skips where there is none."""
     path = REPO.parent / "shared"
     if not path.is_dir():
         pytest.skip("no folder shared/ beside this work tree")
@@ -46,8 +46,9 @@ def firmware_hex():
 
 @pytest.fixture
 def virtual_nano():
-    """Factory of running virtual Nanos: virtual_nano(**options of sparsegaze.virtual.VirtualNano). Stopped after the test."""
+    """Factory of running virtual Nanos: virtual_nano(**options of VirtualNano). Stopped after the test."""
     from sparsegaze.virtual import VirtualNano
+
     running = []
 
     def start(**options):
@@ -62,7 +63,7 @@ def virtual_nano():
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_registry():
-    """Virtual Nanos of the tests register in a folder of their own, apart from those that somebody is using."""
+    """Virtual Nanos of the tests register in a folder of their own, apart from those that somebody uses."""
     # Not pytest's tmp_path: the names of Unix sockets below it must stay under 108 bytes.
     folder = tempfile.mkdtemp(prefix="sgtest-")
     before = os.environ.get("XDG_RUNTIME_DIR")

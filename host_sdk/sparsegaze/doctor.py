@@ -15,7 +15,7 @@ import sys
 from typing import NamedTuple, Optional
 
 PACKAGE = pathlib.Path(__file__).resolve().parent
-SOURCE_TREE = PACKAGE.parent.parent            # the work tree, when this is an editable install of it
+SOURCE_TREE = PACKAGE.parent.parent  # the work tree, when this is an editable install of it
 
 PYTHON_MIN = (3, 11)
 DEPENDENCIES = ("cffi", "click", "intelhex", "numpy", "pyserial", "rich", "scipy")
@@ -30,8 +30,8 @@ class Check(NamedTuple):
     """One line of the examination.
 
     name     what was looked for
-    ok       True: there; False: missing, and flashing, calibrating or streaming needs it; None: missing, and only what the
-             remedy names needs it
+    ok       True: there. False: missing, and flashing, calibrating or streaming needs it. None: missing,
+             and only what the remedy names needs it
     found    what was found, one line
     remedy   how to get it and what for, one line; empty when ok is True
     """
@@ -44,10 +44,21 @@ class Check(NamedTuple):
 
 def examine():
     """All checks, in the order in which things build on each other. Returns a list of Check."""
-    return [python_version(), dependencies(), core(), firmware(), ports(), serial_permission(), avr_toolchain(),
-            bootloaders(), virtual_nano(), simulator(), avrdude(),
-            extra("pygame-ce", "pygame", "screen", "the calibration screen on a real device"),
-            extra("matplotlib", "matplotlib", "pictures", "drawing reports and maps")]
+    return [
+        python_version(),
+        dependencies(),
+        core(),
+        firmware(),
+        ports(),
+        serial_permission(),
+        avr_toolchain(),
+        bootloaders(),
+        virtual_nano(),
+        simulator(),
+        avrdude(),
+        extra("pygame-ce", "pygame", "screen", "the calibration screen on a real device"),
+        extra("matplotlib", "matplotlib", "pictures", "drawing reports and maps"),
+    ]
 
 
 def python_version():
@@ -55,7 +66,7 @@ def python_version():
     found = ".".join(map(str, sys.version_info[:3]))
     if sys.version_info >= PYTHON_MIN:
         return Check("Python", True, found)
-    return Check("Python", False, found, "install Python %d.%d or later" % PYTHON_MIN)
+    return Check("Python", False, found, f"install Python {PYTHON_MIN[0]}.{PYTHON_MIN[1]} or later")
 
 
 def dependencies():
@@ -64,8 +75,12 @@ def dependencies():
     found = ", ".join(f"{name} {_version(name)}" for name in DEPENDENCIES if name not in missing)
     if not missing:
         return Check("Python packages", True, found)
-    return Check("Python packages", False, "missing: " + ", ".join(missing),
-                 f"{sys.executable} -m pip install {' '.join(missing)}")
+    return Check(
+        "Python packages",
+        False,
+        "missing: " + ", ".join(missing),
+        f"{sys.executable} -m pip install {' '.join(missing)}",
+    )
 
 
 def core():
@@ -74,8 +89,13 @@ def core():
         module = importlib.import_module("sparsegaze._core")
         version = module.lib.SG_WIRE_VERSION
     except (ImportError, OSError, AttributeError) as error:
-        return Check("C core", False, _line(error), "make native in a work tree; elsewhere install sparsegaze again, with a "
-                     "C compiler and Python's headers (gcc, python3-dev)")
+        return Check(
+            "C core",
+            False,
+            _line(error),
+            "make native in a work tree; elsewhere install sparsegaze again, with a "
+            "C compiler and Python's headers (gcc, python3-dev)",
+        )
     return Check("C core", True, f"speaks protocol {version}")
 
 
@@ -84,14 +104,16 @@ def firmware():
     path = PACKAGE / "data" / "firmware.hex"
     if path.is_file():
         return Check("firmware", True, str(path))
-    return Check("firmware", False, f"no {path}", "make firmware in a work tree, or give sparsegaze flash --hex FILE")
+    return Check(
+        "firmware", False, f"no {path}", "make firmware in a work tree, or give sparsegaze flash --hex FILE"
+    )
 
 
 def ports():
     """Serial ports and running virtual Nanos."""
     try:
         found = importlib.import_module("sparsegaze.registry").ports()
-    except Exception as error:      # whatever a platform's port listing throws belongs in the report, not in a traceback
+    except Exception as error:  # whatever a platform's listing throws belongs in the report
         return Check("ports", False, _line(error), "install pyserial 3.5 or later")
     if found:
         return Check("ports", True, ", ".join(f"{port.port} ({port.kind})" for port in found))
@@ -110,6 +132,7 @@ def serial_permission():
     if refused:
         return Check(name, False, "may not open " + ", ".join(refused), remedy)
     import grp
+
     groups = {_group_name(grp, group) for group in os.getgroups()}
     group = next((group for group in ("dialout", "uucp") if group in groups), None)
     if group or _serial_ports():
@@ -137,8 +160,12 @@ def bootloaders():
     missing = [title for title, path in BOOTLOADER_HEXES.items() if not (BOOTLOADERS / path).is_file()]
     if not missing:
         return Check(name, True, f"{', '.join(BOOTLOADER_HEXES)} ({BOOTLOADERS})")
-    return Check(name, None, "missing: " + ", ".join(missing),
-                 "apt-get install arduino-core-avr; needed for virtual Nanos")
+    return Check(
+        name,
+        None,
+        "missing: " + ", ".join(missing),
+        "apt-get install arduino-core-avr; needed for virtual Nanos",
+    )
 
 
 def virtual_nano():
@@ -146,8 +173,9 @@ def virtual_nano():
     name = "virtual Nano"
     program = SOURCE_TREE / "tools" / "vheadset" / "vheadset"
     if not program.is_file():
-        return Check(name, None, f"no {program}",
-                     "make setup native in a work tree; needed to work without hardware")
+        return Check(
+            name, None, f"no {program}", "make setup native in a work tree; needed to work without hardware"
+        )
     # 126 and 127 are the loader's: built, but a library (libsimavr, libelf) has gone since.
     code, text = _run([str(program)])
     if code in (None, 126, 127):
@@ -160,8 +188,12 @@ def simulator():
     try:
         importlib.import_module("sparsegaze._sim")
     except (ImportError, OSError) as error:
-        return Check("simulator", None, _line(error),
-                     "make setup native in a work tree (libembree-dev); needed for virtual Nanos and placement maps")
+        return Check(
+            "simulator",
+            None,
+            _line(error),
+            "make setup native in a work tree (libembree-dev); needed for virtual Nanos and placement maps",
+        )
     return Check("simulator", True, "loads")
 
 
@@ -170,7 +202,9 @@ def avrdude():
     program = shutil.which("avrdude")
     if program:
         return Check("avrdude", True, program)
-    return Check("avrdude", None, "none", "apt-get install avrdude; only needed for pio -t upload and for one test")
+    return Check(
+        "avrdude", None, "none", "apt-get install avrdude; only needed for pio -t upload and for one test"
+    )
 
 
 def extra(distribution, module, name, purpose):
@@ -178,7 +212,12 @@ def extra(distribution, module, name, purpose):
     version = _version(distribution)
     if version and importlib.util.find_spec(module):
         return Check(distribution, True, version)
-    return Check(distribution, None, "none", f"{sys.executable} -m pip install {distribution} (extra {name}); for {purpose}")
+    return Check(
+        distribution,
+        None,
+        "none",
+        f"{sys.executable} -m pip install {distribution} (extra {name}); for {purpose}",
+    )
 
 
 def _version(distribution):
@@ -191,6 +230,7 @@ def _version(distribution):
 def _serial_ports():
     try:
         from serial.tools import list_ports
+
         return [port.device for port in list_ports.comports()]
     except ImportError:
         return []
@@ -204,9 +244,11 @@ def _group_name(grp, number):
 
 
 def _run(command):
-    """Exit code and text of a command that is expected to end at once; (None, reason) when it does not run or end."""
+    """Exit code and text of a command that ends at once; (None, reason) when it does not run or end."""
     try:
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=10, check=False)
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=10, check=False
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
         return None, str(error)
     return done.returncode, done.stderr or done.stdout
