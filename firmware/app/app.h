@@ -20,7 +20,9 @@
 struct app_state {
     struct sg_link_rx link;
     struct sg_expose_led led[HAL_CHANNELS];
-    struct sg_hello hello;              // filled once; also the source of the exposure limits
+    uint16_t exposure_min_cycles;       // the board's limits, inside the core's
+    uint16_t exposure_max_cycles;
+    uint16_t slot_bytes;
     uint16_t tx_dropped;
     uint16_t rx_rejected;
     uint16_t saturated;
@@ -33,12 +35,10 @@ extern struct app_state app;
 
 // main.c
 void app_count(uint16_t *counter);                          // up to 65535
-uint16_t app_exposure_limit(uint16_t exposure_cycles);      // into the board's limits, which are inside the core's
+uint16_t app_exposure_limit(uint16_t exposure_cycles);      // into the board's limits
 uint8_t app_send(uint8_t type, uint16_t seq, const void *body, uint8_t n, uint8_t keep_free);   // 1 if queued
 
-// app_requests.c
-void app_request(const struct sg_head *head, const uint8_t *body, uint8_t n, uint32_t arrived_us);
-void app_refuse(uint8_t type, uint16_t seq, int8_t error);
+void app_describe(struct sg_hello *hello);
 
 // app_models.c
 void app_models_start(void);                                // validate both slots, take the newest

@@ -34,7 +34,7 @@ static const uint8_t *slot_image(uint8_t slot)
 
 static uint16_t slot_room(uint8_t slot)
 {
-    return slot == SG_SLOT_RAM ? (uint16_t)HAL_TRIAL_BYTES : (uint16_t)app.hello.slot_bytes;
+    return slot == SG_SLOT_RAM ? (uint16_t)HAL_TRIAL_BYTES : app.slot_bytes;
 }
 
 static uint8_t slot_space(uint8_t slot)

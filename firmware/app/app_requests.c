@@ -7,7 +7,9 @@
 
 enum { REBOOT_KEY = 0xA5, STREAM_ALL = SG_STREAM_RAW | SG_STREAM_GAZE | SG_STREAM_COUNTS };
 
-union body {                    // of a request, or of its answer
+// Of a request and of its answer, in one place: RAM is short, and an answer is made when its request is read.
+union body {
+    struct sg_hello hello;
     struct sg_status status;
     struct sg_ping ping;
     struct sg_pong pong;
@@ -23,11 +25,13 @@ union body {                    // of a request, or of its answer
     uint8_t bytes[SG_WIRE_BODY_MAX];
 };
 
-void app_refuse(uint8_t type, uint16_t seq, int8_t error)
+static union body body;
+
+static void refuse(uint8_t type, uint16_t seq, int8_t error)
 {
-    const struct sg_error body = { .error = error, .type = type };
+    const struct sg_error why = { .error = error, .type = type };
     app_count(&app.rx_rejected);
-    app_send(SG_MSG_ERROR, seq, &body, sizeof body, 0);
+    app_send(SG_MSG_ERROR, seq, &why, sizeof why, 0);
 }
 
 // Shortest body of a request, bytes; -1: there is no such request.
@@ -81,15 +85,15 @@ static void status(struct sg_status *out)
     hal_report(out);
 }
 
-static int8_t exposure(struct sg_exposure *body)
+static int8_t exposure(struct sg_exposure *io)
 {
     uint16_t cycles[HAL_CHANNELS];
-    switch (body->op) {
+    switch (io->op) {
     case SG_EXPOSURE_GET:
         break;
     case SG_EXPOSURE_SET:
         for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-            cycles[i] = app_exposure_limit(sg_expose_from_us_q2(body->exposure_us_q2[i]));
+            cycles[i] = app_exposure_limit(sg_expose_from_us_q2(io->exposure_us_q2[i]));
             sg_expose_start(&app.led[i], cycles[i]);
         }
         hal_expose(cycles);
@@ -106,69 +110,68 @@ static int8_t exposure(struct sg_exposure *body)
     default:
         return SG_E_ARG;
     }
-    if (body->op != SG_EXPOSURE_GET)
+    if (io->op != SG_EXPOSURE_GET)
         app_live_keep_exposures();
     for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        body->exposure_us_q2[i] = sg_expose_to_us_q2(app.led[i].exposure_cycles);
-    body->op = app.exposure_auto ? SG_EXPOSURE_AUTO : SG_EXPOSURE_HOLD;
-    body->reserved = 0;
+        io->exposure_us_q2[i] = sg_expose_to_us_q2(app.led[i].exposure_cycles);
+    io->op = app.exposure_auto ? SG_EXPOSURE_AUTO : SG_EXPOSURE_HOLD;
+    io->reserved = 0;
     return SG_OK;
 }
 
-static int8_t recentre(struct sg_recentre *body)
+static int8_t recentre(struct sg_recentre *io)
 {
-    if (body->op > SG_RECENTRE_CLEAR)
+    if (io->op > SG_RECENTRE_CLEAR)
         return SG_E_ARG;
-    if (body->op == SG_RECENTRE_SET && !app_model())
+    if (io->op == SG_RECENTRE_SET && !app_model())
         return SG_E_STATE;              // an offset belongs to a model
-    if (body->op == SG_RECENTRE_SET)
-        app_recentre_set(body->az_deg_q7, body->el_deg_q7);
-    else if (body->op == SG_RECENTRE_CLEAR)
+    if (io->op == SG_RECENTRE_SET)
+        app_recentre_set(io->az_deg_q7, io->el_deg_q7);
+    else if (io->op == SG_RECENTRE_CLEAR)
         app_recentre_set(0, 0);
     const int16_t *now = app_recentre();
-    body->az_deg_q7 = now[0];
-    body->el_deg_q7 = now[1];
-    body->reserved = 0;
+    io->az_deg_q7 = now[0];
+    io->el_deg_q7 = now[1];
+    io->reserved = 0;
     return SG_OK;
 }
 
-static void infer(union body *body)
+static void infer(void)
 {
     uint16_t feature[HAL_CHANNELS];
-    memcpy(feature, body->infer.feature, sizeof feature);
+    memcpy(feature, body.infer.feature, sizeof feature);
     const uint8_t flags = app_model_slot() == SG_SLOT_RAM ? SG_FLAG_TRIAL : 0;
-    sg_track_infer(app_model(), feature, flags, app_recentre(), &body->gaze);
+    sg_track_infer(app_model(), feature, flags, app_recentre(), &body.gaze);
 }
 
-static int8_t trial_write(union body *body, uint8_t n)
+static int8_t trial_write(uint8_t n)
 {
-    if (body->data.length > n - offsetof(struct sg_model_data, data))
+    if (body.data.length > n - offsetof(struct sg_model_data, data))
         return SG_E_SHORT;
-    const int8_t result = app_trial_write(&body->data);
+    const int8_t result = app_trial_write(&body.data);
     // The answer's fields are the request's, in another order.
-    const struct sg_model_at at = { .offset = body->data.offset, .slot = body->data.slot,
-                                    .length = body->data.length };
-    body->at = at;
+    const struct sg_model_at at = { .offset = body.data.offset, .slot = body.data.slot,
+                                    .length = body.data.length };
+    body.at = at;
     return result;
 }
 
-void app_request(const struct sg_head *head, const uint8_t *request, uint8_t n, uint32_t arrived_us)
+// `body` holds the n bytes of the request, and then its answer.
+static void request(const struct sg_head *head, uint8_t n, uint32_t arrived_us)
 {
-    union body body;
     uint8_t answer_bytes = 0;
     int8_t result = SG_OK;
     uint8_t answered = 0;               // later, by app_models_step()
     const int8_t least = shortest(head->type);
 
     if (least < 0 || n < (uint8_t)least) {
-        app_refuse(head->type, head->seq, least < 0 ? SG_E_UNKNOWN : SG_E_SHORT);
+        refuse(head->type, head->seq, least < 0 ? SG_E_UNKNOWN : SG_E_SHORT);
         return;
     }
-    memcpy(body.bytes, request, n);
     switch (head->type) {
     case SG_MSG_HELLO:
-        memcpy(body.bytes, &app.hello, sizeof app.hello);
-        answer_bytes = sizeof app.hello;
+        app_describe(&body.hello);
+        answer_bytes = sizeof body.hello;
         break;
     case SG_MSG_STATUS:
         status(&body.status);
@@ -187,7 +190,7 @@ void app_request(const struct sg_head *head, const uint8_t *request, uint8_t n, 
         answer_bytes = sizeof body.mode;
         break;
     case SG_MSG_INFER:
-        infer(&body);
+        infer();
         answer_bytes = sizeof body.gaze;
         break;
     case SG_MSG_MODEL_INFO:
@@ -205,7 +208,7 @@ void app_request(const struct sg_head *head, const uint8_t *request, uint8_t n, 
         answered = 1;
         break;
     case SG_MSG_TRIAL_WRITE:
-        result = trial_write(&body, n);
+        result = trial_write(n);
         answer_bytes = sizeof body.at;
         break;
     case SG_MSG_TRIAL_USE:
@@ -238,7 +241,7 @@ void app_request(const struct sg_head *head, const uint8_t *request, uint8_t n, 
     }
 
     if (result != SG_OK) {
-        app_refuse(head->type, head->seq, result);
+        refuse(head->type, head->seq, result);
         return;
     }
     if (answered)
@@ -248,4 +251,12 @@ void app_request(const struct sg_head *head, const uint8_t *request, uint8_t n, 
         hal_after_sending(HAL_AFTER_REBOOT);
     if (head->type == SG_MSG_BAUD)
         hal_after_sending(body.mode.mode ? HAL_AFTER_BAUD_500K : HAL_AFTER_BAUD_1M);
+}
+
+void app_on_byte(uint8_t byte, uint32_t zero_us)
+{
+    struct sg_head head;
+    const int n = sg_link_receive(&app.link, byte, &head, body.bytes);
+    if (n >= 0)
+        request(&head, (uint8_t)n, zero_us);
 }

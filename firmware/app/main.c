@@ -20,9 +20,9 @@ void app_count(uint16_t *counter)
 
 uint16_t app_exposure_limit(uint16_t exposure_cycles)
 {
-    const uint16_t low = app.hello.exposure_min_us * (uint16_t)SG_EXPOSE_CYCLES_PER_US;
-    const uint16_t high = app.hello.exposure_max_us * (uint16_t)SG_EXPOSE_CYCLES_PER_US;
-    return exposure_cycles < low ? low : exposure_cycles > high ? high : exposure_cycles;
+    if (exposure_cycles < app.exposure_min_cycles)
+        return app.exposure_min_cycles;
+    return exposure_cycles > app.exposure_max_cycles ? app.exposure_max_cycles : exposure_cycles;
 }
 
 uint8_t app_send(uint8_t type, uint16_t seq, const void *body, uint8_t n, uint8_t keep_free)
@@ -131,16 +131,7 @@ void app_on_frame(const struct hal_frame *frame)
     HAL_END(HAL_SECTION_FRAME);
 }
 
-void app_on_byte(uint8_t byte, uint32_t zero_us)
-{
-    static uint8_t body[SG_WIRE_BODY_MAX];
-    struct sg_head head;
-    const int n = sg_link_receive(&app.link, byte, &head, body);
-    if (n >= 0)
-        app_request(&head, body, (uint8_t)n, zero_us);
-}
-
-static void describe(struct sg_hello *hello)
+void app_describe(struct sg_hello *hello)
 {
     hal_describe(hello);
     hello->firmware = APP_FIRMWARE_VERSION;
@@ -150,12 +141,16 @@ static void describe(struct sg_hello *hello)
     hello->channels = HAL_CHANNELS;
 }
 
-int main(void)
+static void start(void)
 {
     uint16_t exposure[HAL_CHANNELS];
+    struct sg_hello hello;
 
     hal_boot();
-    describe(&app.hello);
+    app_describe(&hello);
+    app.exposure_min_cycles = hello.exposure_min_us * (uint16_t)SG_EXPOSE_CYCLES_PER_US;
+    app.exposure_max_cycles = hello.exposure_max_us * (uint16_t)SG_EXPOSE_CYCLES_PER_US;
+    app.slot_bytes = (uint16_t)hello.slot_bytes;
     app_models_start();
     app_live_start();
     app_live_exposures(exposure, &app.exposure_auto);
@@ -164,6 +159,11 @@ int main(void)
         exposure[i] = app.led[i].exposure_cycles;
     }
     hal_start(exposure);
+}
+
+int main(void)
+{
+    start();
     while (hal_poll()) {
         app_models_step();
         app_live_step();

@@ -4,7 +4,7 @@
 
 enum {
     RX_RING = 128,                      // power of two
-    TX_RING = 256,                      // indices wrap by themselves
+    TX_RING = 192,                      // a frame of all three streams (92), an answer (72), and some
     BYTES_PER_POLL = 32,                // so that a flood of bytes cannot keep a frame waiting
     DRAIN_CYCLES = 4 * 10 * 2 * 16,     // the last two bytes leave the shift register, at the lower speed
 };
@@ -48,7 +48,9 @@ ISR(USART_UDRE_vect)
 {
     HAL_BEGIN(HAL_SECTION_SERIAL);
     uint8_t tail = tx_tail;
-    UDR0 = tx_ring[tail++];
+    UDR0 = tx_ring[tail];
+    if (++tail == TX_RING)
+        tail = 0;
     tx_tail = tail;
     if (tail == tx_head)
         UCSR0B = (1 << RXCIE0) | (1 << RXEN0) | (1 << TXEN0);
@@ -66,7 +68,8 @@ void serial_start(void)
 
 uint8_t serial_room(void)
 {
-    return (uint8_t)(tx_tail - tx_head - 1);
+    const uint8_t tail = tx_tail, head = tx_head;
+    return (tail > head ? tail : tail + TX_RING) - head - 1;
 }
 
 uint8_t hal_send(const uint8_t *bytes, uint8_t n, uint8_t keep_free)
@@ -74,8 +77,11 @@ uint8_t hal_send(const uint8_t *bytes, uint8_t n, uint8_t keep_free)
     uint8_t head = tx_head;
     if (after_pending || (uint16_t)n + keep_free > serial_room())
         return 0;
-    while (n--)
-        tx_ring[head++] = *bytes++;
+    while (n--) {
+        tx_ring[head] = *bytes++;
+        if (++head == TX_RING)
+            head = 0;
+    }
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
         tx_head = head;
         UCSR0B = (1 << RXCIE0) | (1 << RXEN0) | (1 << TXEN0) | (1 << UDRIE0);
