@@ -1,0 +1,364 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a float64 Gaussian process to the few integer vectors that an 8-bit device can carry.
+
+The device's mean is  bias + trend . s + sum_i w_i k(s, c_i)  (firmware/core/sg_model.h). Everything in it is fitted to
+the process's mean over a cloud of likely inputs: the centres by variable projection and L-BFGS, rounded in stages; then
+trend, weights and bias, one after the other, on the integer kernel values of the device itself, so that the rounding of
+each is made good by those still free. DESIGN.md section 5; notes on what each step buys stand beside it.
+"""
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+
+from .errors import CalibrationError, ModelError
+from .fixations import TARGETS_NEEDED, fixations
+from .gp import GaussianProcess, Hyper
+from .model import (CHANNELS, GUARDS_MAX, S_FRAC, S_MAX, U_STEPS, VECTORS_MAX, WEIGHT_FRAC_BITS, DeviceModel, emulate,
+                    kernel_q16, quantise)
+
+LENGTH_SHARE = 0.7          # the device's length scale over the process's: more kernels, smaller weights
+BOX_MARGIN = 0.12           # of a channel's calibrated range, on each side
+BOX_SIGMAS = 6.0            # and at least this many frame-noise deviations
+GUARD_MARGIN = 0.20
+GUARD_SIGMAS = 6.0
+TAIL = 5e-4                 # quantile taken for the end of the calibrated range: a stray frame does not widen it
+KERNEL_ERROR = 3.0          # of a device kernel value, Q0.16 steps
+RIDGE = 1e-9                # of the mean squared kernel value, while centres move
+POINTS = 3000
+NEIGHBOURS = 8
+ROUNDING = (0.5, 0.75, 0.9, 1.0)
+MEAN = "constant"
+FRAMES_EACH = 12            # frames of each fixation that the process is given: the noise it will have to live with
+NOISE_SHARE = 0.5
+CLOUD_EACH = 50
+OUTLIER_SIGMAS, OUTLIER_ROUNDS = 6.0, 3
+FIRST_STEPS, LATER_STEPS = 120, 25
+
+
+@dataclass(frozen=True)
+class DistilReport:
+    """How far the device model is from the process it was made from, and what it uses.
+
+    rms_deg, max_deg   distance over held-out likely inputs, by the device's integer arithmetic
+    out_of_range       share of those inputs that its guards refuse
+    n_vectors, weight_frac_bits, weight_range_deg (least, largest), reach_deg (proven bound of |gaze| before wrapping,
+    and what the accumulator holds), points (used to fit)
+    """
+    rms_deg: float
+    max_deg: float
+    out_of_range: float
+    n_vectors: int
+    weight_frac_bits: int
+    weight_range_deg: tuple
+    reach_deg: tuple
+    points: int
+
+
+def distil(gp, features, gaze_deg, n_vectors=64, seed=0, noise=None, points=POINTS):
+    """Make a DeviceModel from a fitted GaussianProcess.
+
+    features    [n, d] frames of the calibration, blinks excluded: their cloud is the range of the model
+    gaze_deg    [n, 2] where those frames were looking (used to find neighbours, not as labels)
+    noise       [d] rms of one frame, feature units; default: from neighbours in gaze
+    Returns (DeviceModel, DistilReport); a pure function of its arguments. Raises CalibrationError or ModelError.
+    """
+    features, gaze = np.asarray(features, float), np.asarray(gaze_deg, float)
+    if not 1 <= n_vectors <= VECTORS_MAX:
+        raise ModelError(f"{n_vectors} vectors do not fit the device", f"ask for 1 to {VECTORS_MAX}")
+    if len(features) < 2 or features.shape[1] > CHANNELS:
+        raise CalibrationError(f"{len(features)} samples of {features.shape[1]} channels are too few or too wide",
+                               f"give at least 2 samples of at most {CHANNELS} channels")
+    rng = np.random.default_rng([0x647374, seed])
+    order = np.lexsort(np.column_stack([features, gaze]).T)     # the order of the samples must not matter
+    features, gaze = features[order], gaze[order]
+    noise = np.zeros(features.shape[1]) if noise is None else np.asarray(noise, float)
+    offset, gain = box(gp, features, noise)
+    cloud = likely_inputs(rng, features, gaze, noise, points + points // 3)
+    s, clamped = quantise(np.clip(np.rint(cloud), 0, 65535), offset, gain)
+    s, cloud = s[~clamped], cloud[~clamped]
+    # The process is asked at the very inputs that the device sees, quantised.
+    target = gp.predict(unquantise(s, offset, gain, cloud))
+    held = np.arange(len(s)) % 4 == 3
+    n_vectors = min(n_vectors, max(1, int((~held).sum()) // 4))
+    centres = optimise_centres(rng, s[~held], target[~held], n_vectors, gain > 0)
+    rails = guards(features, offset, gain, noise)
+    model, reach = assemble(s[~held], target[~held], centres, offset, gain, rails)
+    fitted = np.clip(np.rint(cloud[held]), 0, 65535).astype(np.uint16)
+    az, el, flags = emulate(model, fitted)
+    miss = np.hypot(az / 128.0 - target[held, 0], el / 128.0 - target[held, 1])
+    weights = model.weights / 2.0 ** model.weight_frac_bits
+    return model, DistilReport(
+        float(np.sqrt(np.mean(miss ** 2))), float(miss.max()), float(np.mean(flags & 4 != 0)), model.vectors,
+        model.weight_frac_bits, (float(weights.min()), float(weights.max())), reach, int((~held).sum()))
+
+
+def box(gp, features, noise):
+    """Offset and gain of every channel: (offset int64 [d], gain_q12 int64 [d]).
+
+    The box holds the calibrated range and a margin, so that ordinary gaze never clips. A channel's gain is set by the
+    process's length scale where the box allows it, and by the box where not. Channels that the process dropped, and
+    those without influence, have gain 0.
+    """
+    low, high = np.quantile(features, [TAIL, 1 - TAIL], axis=0)
+    margin = np.maximum(BOX_MARGIN * (high - low), BOX_SIGMAS * noise) + 2
+    low, high = np.maximum(low - margin, 0), np.minimum(high + margin, 65535)
+    by_box = S_MAX / (high - low)
+    by_length = U_STEPS * S_FRAC / (LENGTH_SHARE * gp.hyper.length)
+    linear = gp.mean == "linear"
+    gain = np.where(np.isfinite(gp.hyper.length), np.minimum(by_box, np.maximum(by_length, linear * by_box / 8)), 0.0)
+    gain_q12 = np.minimum(np.floor(4096 * gain), 65535).astype(np.int64)
+    offset = np.where(gain_q12 > 0, np.floor(low), 0).astype(np.int64)
+    return offset, gain_q12
+
+
+def unquantise(s, offset, gain_q12, like):
+    """Features in the middle of the steps s; channels without gain keep their values from `like`."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        middle = offset + (s + 0.5) * 4096.0 / gain_q12
+    return np.where(gain_q12 > 0, middle, like)
+
+
+def likely_inputs(rng, features, gaze, noise, count):
+    """`count` inputs such as the device will meet: frames, mixtures of neighbours in gaze, and frame noise on both."""
+    n = len(features)
+    anchor = rng.integers(0, n, count)
+    reach = min(n, NEIGHBOURS * max(1, n // 150))
+    pool = rng.choice(n, min(n, 4000), replace=False)
+    mixed = np.empty((count, features.shape[1]))
+    for rows in np.array_split(np.arange(count), max(1, count // 500)):
+        distance = ((gaze[anchor[rows], None] - gaze[pool]) ** 2).sum(-1)
+        near = pool[np.argpartition(distance, min(reach, len(pool) - 1), axis=1)[:, :reach]]
+        partner = near[np.arange(len(rows)), rng.integers(0, near.shape[1], len(rows))]
+        share = rng.random((len(rows), 1)) * (rng.random((len(rows), 1)) < 0.6)
+        mixed[rows] = (1 - share) * features[anchor[rows]] + share * features[partner]
+    return mixed + noise * rng.standard_normal(mixed.shape)
+
+
+def optimise_centres(rng, s, target, n_vectors, free):
+    """Centres [n_vectors, d] in 0..255 for the least squared distance to target [m, 2] at inputs s [m, d] (u8.4).
+
+    Variable projection: for given centres the weights and the trend are a linear least-squares problem, and at its
+    solution the derivative in the centres needs no derivative of the weights (Golub & Pereyra 1973). Bounds keep the
+    centres in the box; in stages the coordinates nearest to integers are frozen there and the rest moves on: rounding
+    all at once at the end costs three times the error.
+    """
+    x = s / S_FRAC / U_STEPS
+    linear = np.hstack([np.ones((len(x), 1)), x[:, free] - x[:, free].mean(axis=0)])
+    level = np.sqrt(np.mean((target - target.mean(axis=0)) ** 2))
+    y = (target - target.mean(axis=0)) / max(level, 1e-9)
+    centres = maximin(rng, x, n_vectors)
+    top = 255.0 / U_STEPS
+    frozen = np.zeros(centres.shape, bool)
+    frozen[:, ~free] = True
+    centres[:, ~free] = 0.0
+    for stage in (0.0,) + ROUNDING:
+        if stage:
+            steps = centres * U_STEPS
+            gap = np.where(frozen, -1.0, np.abs(steps - np.rint(steps)))
+            gap[:, ~free] = -1.0
+            chosen = gap <= np.quantile(gap[:, free], stage)
+            centres = np.where(chosen, np.clip(np.rint(steps), 0, 255) / U_STEPS, centres)
+            frozen = frozen | chosen
+        if frozen.all():
+            break
+        moving = ~frozen
+
+        def objective(values):
+            trial = centres.copy()
+            trial[moving] = values
+            value, slope = _projected(trial, x, linear, y)
+            return np.log(value), slope[moving] / value     # the scale that L-BFGS's tolerances expect
+
+        found = minimize(objective, centres[moving], jac=True, method="L-BFGS-B",
+                         bounds=[(0.0, top)] * int(moving.sum()),
+                         options={"maxiter": LATER_STEPS if stage else MEAN = "constant"
+FRAMES_EACH = 12            # frames of each fixation that the process is given: the noise it will have to live with
+NOISE_SHARE = 0.5
+CLOUD_EACH = 50
+OUTLIER_SIGMAS, OUTLIER_ROUNDS = 6.0, 3
+FIRST_STEPS, "maxcor": 20, "ftol": 1e-6, "gtol": 1e-6})
+        centres[moving] = found.x
+    return np.clip(np.rint(centres * U_STEPS), 0, 255).astype(np.int64)
+
+
+def _projected(centres, x, linear, y):
+    """Mean squared residual with the best weights, and its derivative in the centres."""
+    d2 = np.sum(x * x, 1)[:, None] + np.sum(centres * centres, 1) - 2.0 * (x @ centres.T)
+    k = np.exp(-0.5 * np.maximum(d2, 0.0))
+    design = np.hstack([k, linear])
+    m = len(x)
+    normal = design.T @ design
+    ridge = RIDGE * m
+    normal[np.diag_indices(len(normal))] += ridge
+    w = cho_solve(cho_factor(normal, check_finite=False), design.T @ y, check_finite=False)
+    residual = design @ w - y
+    value = (np.sum(residual ** 2) + ridge * np.sum(w ** 2)) / m
+    pull = (residual @ w[:len(centres)].T) * k
+    slope = 2.0 / m * (pull.T @ x - pull.sum(axis=0)[:, None] * centres)
+    return value, slope
+
+
+def maximin(rng, x, count):
+    """`count` rows of x, each as far as possible from those before it."""
+    pool = x[rng.choice(len(x), min(len(x), 2000), replace=False)]
+    chosen = [int(np.argmin(((pool - pool.mean(axis=0)) ** 2).sum(1)))]
+    nearest = np.full(len(pool), np.inf)
+    while len(chosen) < count:
+        nearest = np.minimum(nearest, ((pool - pool[chosen[-1]]) ** 2).sum(1))
+        chosen.append(int(np.argmax(nearest)))
+    return pool[chosen].copy()
+
+
+def assemble(s, target, centres, offset, gain, rails):
+    """Trend, weights and bias in the device's integers, on the device's own kernel values.
+
+    Takes the finest weight format whose weights fit 16 bits and whose sum provably fits 32.
+    Returns (DeviceModel, (proven bound of |gaze| in degrees, what the accumulator holds)).
+    """
+    k = kernel_q16(s, centres) / 65536.0
+    design = np.hstack([k, s / 4096.0, np.ones((len(s), 1))])
+    n, d = len(centres), s.shape[1]
+    normal = design.T @ design
+    for bits, ridge in [(b, r) for r in (RIDGE, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4) for b in reversed(WEIGHT_FRAC_BITS)]:
+        damped = normal + np.diag(np.r_[np.full(n, ridge), np.full(d, 1e-9), 0.0]) * len(s)
+        fine = 2.0 ** -(bits + 16)
+        unit = np.r_[np.full(n, 2.0 ** -bits), np.full(d, 4096.0 * fine), fine]
+        whole = _round_in_turn(damped, design.T @ target, unit, np.r_[np.arange(n, n + d), np.arange(n), n + d])
+        weights, trend, bias = whole[:n], whole[n:n + d].T, whole[-1]
+        if np.abs(weights).max() > 32767 or np.abs(whole[n:]).max() >= 2 ** 31:
+            continue
+        bound = reach(weights, trend, bias, centres)
+        if bound < 2 ** 31:
+            model = DeviceModel.from_parts(offset, gain, bias, trend, centres, weights, bits, rails)
+            return model, (float(bound * fine), float(2 ** 31 * fine))
+    raise CalibrationError("no number format holds the weights of this model", "calibrate again with more targets")
+
+
+def _round_in_turn(normal, moment, unit, order):
+    """Least-squares solution whose entries are whole multiples of `unit`: int64, same shape as moment.
+
+    Entries are rounded in the given order; after each, those still free are solved anew given all the rounded ones.
+    """
+    scale = 1.0 / np.sqrt(np.diag(normal))
+    normal = normal * scale[:, None] * scale
+    normal[np.diag_indices(len(normal))] += 1e-14
+    inverse = cho_solve(cho_factor(normal), np.eye(len(normal)))
+    value = inverse @ (moment * scale[:, None])
+    step = unit / scale
+    whole = np.zeros(moment.shape, np.int64)
+    for i in order:
+        whole[i] = np.rint(value[i] / step[i]).astype(np.int64)
+        error = (value[i] - whole[i] * step[i]) / inverse[i, i]
+        value = value - np.outer(inverse[:, i], error)
+        inverse = inverse - np.outer(inverse[:, i], inverse[i]) / inverse[i, i]
+    return whole
+
+
+def reach(weights, trend, bias, centres):
+    """Bound of |bias + trend . s + sum w k| over every input of the box, in accumulator steps.
+
+    The trend is bounded at the corners of the box. A sum of kernels is a member f of the kernel's function space, and
+    there |f(s)| <= |f| sqrt(k(s, s)) = sqrt(w' K w), far below the sum of the |w| that nearly cancel; each of the
+    device's kernel values is within KERNEL_ERROR of the exact one (sg_gp.h).
+    """
+    scaled = centres / U_STEPS
+    gram = np.exp(-0.5 * ((scaled[:, None] - scaled) ** 2).sum(-1))
+    bound = 0.0
+    for o in range(2):
+        w = weights[:, o].astype(float)
+        kernels = 65536.0 * np.sqrt(max(w @ gram @ w, 0.0)) + KERNEL_ERROR * np.abs(w).sum()
+        for sign in (1.0, -1.0):
+            bound = max(bound, kernels + sign * bias[o] + S_MAX * np.maximum(sign * trend[o], 0).sum())
+    return float(bound)
+
+
+def guards(features, offset, gain, noise):
+    """Bounds along the principal directions of the calibrated cloud: list of (low, high, row int8 [d]).
+
+    Blinks and slip leave the cloud in directions in which gaze does not move it, long before a single channel leaves
+    its own range.
+    """
+    s, _ = quantise(np.clip(np.rint(features), 0, 65535), offset, gain)
+    live = np.flatnonzero(gain > 0)
+    step_noise = (noise * gain / 4096.0)[live]
+    _, directions = np.linalg.eigh(np.cov(s[:, live].T).reshape(len(live), len(live)))
+    result = []
+    for direction in directions.T[::-1][:GUARDS_MAX]:
+        direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
+        row = np.zeros(s.shape[1], np.int64)
+        row[live] = np.rint(127.0 * direction / np.abs(direction).max())
+        projection = s @ row
+        low, high = np.quantile(projection, [TAIL, 1 - TAIL])
+        margin = max(GUARD_MARGIN * (high - low), GUARD_SIGMAS * float(np.sqrt(row[live] ** 2 @ step_noise ** 2)))
+        result.append((int(np.floor(low - margin)), int(np.ceil(high + margin)), row))
+    return result
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What fit_recording made: gp GaussianProcess, model DeviceModel, report FitReport."""
+    gp: GaussianProcess
+    model: DeviceModel
+    report: "FitReport"
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """How a recording became a model.
+
+    fixations, frames used; rejected_frames (blinks) and outliers (targets [m, 2] that contradict all others)
+    loo_rms_deg  leave-one-fixation-out error of the fixations' means; lml, condition, jitter of the process
+    length [d] feature units, signal_deg, noise_deg; dropped_channels; distil: DistilReport
+    """
+    fixations: int
+    frames: int
+    rejected_frames: int
+    outliers: list
+    loo_rms_deg: float
+    lml: float
+    condition: float
+    jitter: float
+    length: list
+    signal_deg: float
+    noise_deg: float
+    dropped_channels: tuple
+    distil: DistilReport
+
+
+def fit_recording(recording, n_vectors=64, seed=0):
+    """Recording -> FitResult. Raises RecordingError or CalibrationError; warns of channels it drops."""
+    fixed = fixations(recording)
+    learnt = GaussianProcess.fit(fixed.mean, fixed.target, mean=MEAN, seed=seed)
+    lost = []
+    for _ in range(OUTLIER_ROUNDS):
+        predicted, spread = learnt.loo()
+        miss = np.linalg.norm(learnt.y - predicted, axis=1) / spread
+        worst = np.flatnonzero(miss > OUTLIER_SIGMAS)
+        worst = worst[np.argsort(-miss[worst])][:max(1, len(miss) // 20)]
+        if not len(worst) or len(fixed.mean) - len(worst) < TARGETS_NEEDED:
+            break
+        gone = [int(np.flatnonzero((fixed.mean == learnt.x[i]).all(1) & (fixed.target == learnt.y[i]).all(1))[0])
+                for i in worst]
+        lost += [[float(v) for v in fixed.target[i]] for i in gone]
+        fixed = fixed.without(gone)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            learnt = GaussianProcess.fit(fixed.mean, fixed.target, mean=MEAN, seed=seed)
+    predicted, _ = learnt.loo()
+    rows = fixed.frames(FRAMES_EACH)
+    share = len(rows) / len(fixed.mean)
+    hyper = Hyper(learnt.hyper.length, learnt.hyper.signal_deg, learnt.hyper.noise_deg * np.sqrt(share * NOISE_SHARE))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        gp = GaussianProcess.fit(fixed.features[rows], fixed.target_deg[rows], hyper=hyper, mean=MEAN)
+    cloud = fixed.frames(CLOUD_EACH)
+    model, report = distil(gp, fixed.features[cloud], fixed.target_deg[cloud], n_vectors, seed, fixed.noise)
+    return FitResult(gp, model, FitReport(
+        len(fixed.mean), len(fixed.features), fixed.rejected, lost,
+        float(np.sqrt(np.mean(np.sum((learnt.y - predicted) ** 2, axis=1)))), learnt.lml, learnt.condition,
+        learnt.jitter, [float(v) for v in hyper.length], hyper.signal_deg, learnt.hyper.noise_deg, learnt.dropped,
+        report))
