@@ -14,16 +14,13 @@ import subprocess
 import sys
 from typing import NamedTuple, Optional
 
+from .errors import SparsegazeError
+
 PACKAGE = pathlib.Path(__file__).resolve().parent
 SOURCE_TREE = PACKAGE.parent.parent  # the work tree, when this is an editable install of it
 
 PYTHON_MIN = (3, 11)
 DEPENDENCIES = ("cffi", "click", "intelhex", "numpy", "pyserial", "rich", "scipy")
-BOOTLOADERS = pathlib.Path("/usr/share/arduino/hardware/arduino/avr/bootloaders")
-BOOTLOADER_HEXES = {
-    "Optiboot": "optiboot/optiboot_atmega328.hex",
-    "ATmegaBOOT": "atmega/ATmegaBOOT_168_atmega328.hex",
-}
 
 
 class Check(NamedTuple):
@@ -157,21 +154,23 @@ def avr_toolchain():
 def bootloaders():
     """The stock bootloaders that a virtual Nano boots."""
     name = "bootloaders"
-    missing = [title for title, path in BOOTLOADER_HEXES.items() if not (BOOTLOADERS / path).is_file()]
-    if not missing:
-        return Check(name, True, f"{', '.join(BOOTLOADER_HEXES)} ({BOOTLOADERS})")
-    return Check(
-        name,
-        None,
-        "missing: " + ", ".join(missing),
-        "apt-get install arduino-core-avr; needed for virtual Nanos",
-    )
+    try:
+        from . import virtual
+
+        found = [str(virtual.locate_bootloader(title)[1]) for title in virtual.BOOTLOADERS]
+    except (ImportError, SparsegazeError) as error:
+        remedy = getattr(error, "remedy", "") or "make setup"
+        return Check(name, None, _line(getattr(error, "message", error)), remedy + "; for virtual Nanos")
+    return Check(name, True, ", ".join(found))
 
 
 def virtual_nano():
     """The virtual Nano is built, and the simulator library it links loads."""
     name = "virtual Nano"
-    program = SOURCE_TREE / "tools" / "vheadset" / "vheadset"
+    # Not virtual.locate_vheadset(): that builds what is missing, and an examination changes nothing.
+    program = pathlib.Path(
+        os.environ.get("SPARSEGAZE_VHEADSET") or SOURCE_TREE / "tools" / "vheadset" / "vheadset"
+    )
     if not program.is_file():
         return Check(
             name, None, f"no {program}", "make setup native in a work tree; needed to work without hardware"

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from sparsegaze import doctor
+from sparsegaze import doctor, virtual
 
 
 def test_everything_that_setup_installs_is_found():
@@ -21,7 +21,9 @@ def test_everything_that_setup_installs_is_found():
 def test_every_check_that_fails_has_a_remedy_and_none_raises_on_an_empty_machine(monkeypatch, tmp_path):
     monkeypatch.setattr(doctor, "PACKAGE", tmp_path)
     monkeypatch.setattr(doctor, "SOURCE_TREE", tmp_path)
-    monkeypatch.setattr(doctor, "BOOTLOADERS", tmp_path)
+    monkeypatch.setattr(virtual, "BOOTLOADER_FOLDERS", (str(tmp_path),))
+    for variable in ("SPARSEGAZE_OPTIBOOT", "SPARSEGAZE_ATMEGABOOT", "SPARSEGAZE_VHEADSET"):
+        monkeypatch.delenv(variable, raising=False)
     monkeypatch.setattr(doctor, "PYTHON_MIN", (99, 0))
     monkeypatch.setattr(doctor.shutil, "which", lambda name: None)
     monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None)

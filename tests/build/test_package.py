@@ -3,9 +3,9 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
-import tarfile
 import zipfile
 
 import pytest
@@ -33,8 +33,7 @@ def sdist(tmp_path_factory, repo_root):
     done = subprocess.run(
         [sys.executable, "-c", BUILD_SDIST, str(folder)], cwd=tree, check=True, capture_output=True, text=True
     )
-    with tarfile.open(folder / done.stdout.split()[-1]) as archive:
-        archive.extractall(folder / "unpacked", filter="data")
+    shutil.unpack_archive(folder / done.stdout.split()[-1], folder / "unpacked")
     return next((folder / "unpacked").iterdir())
 
 
