@@ -175,12 +175,7 @@ def optimise_centres(rng, s, target, n_vectors, free):
 
         found = minimize(objective, centres[moving], jac=True, method="L-BFGS-B",
                          bounds=[(0.0, top)] * int(moving.sum()),
-                         options={"maxiter": LATER_STEPS if stage else MEAN = "constant"
-FRAMES_EACH = 12            # frames of each fixation that the process is given: the noise it will have to live with
-NOISE_SHARE = 0.5
-CLOUD_EACH = 50
-OUTLIER_SIGMAS, OUTLIER_ROUNDS = 6.0, 3
-FIRST_STEPS, "maxcor": 20, "ftol": 1e-6, "gtol": 1e-6})
+                         options={"maxiter": LATER_STEPS if stage else FIRST_STEPS, "maxcor": 20, "ftol": 1e-6, "gtol": 1e-6})
         centres[moving] = found.x
     return np.clip(np.rint(centres * U_STEPS), 0, 255).astype(np.int64)
 
