@@ -15,13 +15,17 @@ COLUMNS = ("t_us", "host_time_s", "seq", "azimuth_deg", "elevation_deg", "flags"
 
 
 class GazeCsv:
-    """Writes a stream's CSV while it arrives, in whole lines. A context manager. Raises RecordingError."""
+    """Writes a stream's CSV while it arrives, in whole lines. A context manager.
+
+    path  file name, or an open text file (then not closed here).  Raises RecordingError; BrokenPipeError of a pipe.
+    """
 
     def __init__(self, path, meta=None, flush_rows=64):
-        self.path, self.rows, self._flush_rows, self._lines = os.fspath(path), 0, flush_rows, []
-        self._crc = None
+        self.rows, self._flush_rows, self._lines, self._crc = 0, flush_rows, [], None
+        self._owned = not hasattr(path, "write")
+        self.path = os.fspath(path) if self._owned else getattr(path, "name", "the output")
         try:
-            self._file = open(path, "w", encoding="utf-8", newline="\n")
+            self._file = open(path, "w", encoding="utf-8", newline="\n") if self._owned else path
         except OSError as error:
             raise self._unwritable(error) from None
         for key, value in (meta or {}).items():
@@ -52,16 +56,19 @@ class GazeCsv:
         try:
             self._file.write("".join(lines))
             self._file.flush()
+        except BrokenPipeError:
+            raise
         except OSError as error:
             raise self._unwritable(error) from None
 
     def close(self):
-        """Flush and close; harmless when closed already."""
+        """Flush, and close what was opened here; harmless when closed already."""
         if not self._file.closed:
             try:
                 self.flush()
             finally:
-                self._file.close()
+                if self._owned:
+                    self._file.close()
 
     def __enter__(self):
         return self

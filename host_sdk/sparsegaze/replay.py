@@ -4,6 +4,7 @@
 One C function, sg_track_infer, is what the device calls for every frame; here it runs through sparsegaze._core.
 """
 import csv
+import os
 
 import numpy as np
 
@@ -97,6 +98,19 @@ def run(path, model):
         same = (np.round(np.where(have[:, None], said, 0.0) * DEG_Q7) == gaze_q7).all(axis=1) & (flags == out)
         compared, differing = int(have.sum()), int(np.sum(have & ~same))
     return Replay(t_us, gaze_q7, out, lib.SG_FLAG_VALID, compared, differing)
+
+
+def write(done, path):
+    """Write a Replay as CSV: t_us, azimuth_deg, elevation_deg (nan where not valid), flags. Raises RecordingError."""
+    part = f"{path}.part"
+    try:
+        with open(part, "w", encoding="utf-8", newline="\n") as file:
+            file.write("t_us,azimuth_deg,elevation_deg,flags\n")
+            for t_us, (azimuth, elevation), flags in zip(done.t_us, done.gaze_deg, done.flags):
+                file.write(f"{t_us},{azimuth:.7f},{elevation:.7f},{flags}\n")
+        os.replace(part, path)
+    except OSError as error:
+        raise RecordingError(f"cannot write {path}: {error.strerror}", "choose another place with -o") from None
 
 
 def read_columns(path):
