@@ -25,7 +25,7 @@ HELLO_EVERY_S = 0.25
 CONNECT_S = 6.0
 TRY_TIMEOUTS_S = (0.5, 1.0, 2.0)
 BUSY_WAIT_S = 0.02
-INFER_WINDOW = 2                # requests under way: more would overrun the device's receive buffer
+INFER_WINDOW = 4                # requests under way, 21 bytes each: the device's receive buffer has 128
 INFER_TRIES = 4
 PING_EVERY_S = 1.0
 QUEUE_FRAMES = 4096             # stream frames kept while a request waits for its answer
@@ -98,9 +98,14 @@ class Device:
                 self.link.close()
             self.link = None
 
-    def connect(self, timeout_s=CONNECT_S, boot_wait_s=BOOT_WAIT_S):
-        """Wait for the firmware to start and say HELLO. Called by the constructor; again after a reset."""
+    def connect(self, timeout_s=CONNECT_S, boot_wait_s=None):
+        """Wait for the firmware to start and say HELLO. Called by the constructor; again after a reset.
+
+        boot_wait_s  silence before the first request (default: until the bootloader has given up waiting)
+        """
         link, start = self.link, self.link.now()
+        if boot_wait_s is None:
+            boot_wait_s = max(0.0, link.reset_s + BOOT_WAIT_S - start)
         self.hello = None
         self._stream_bits = 0
         self._decoder = decoder = wire.Decoder()
@@ -311,7 +316,10 @@ class Device:
             raise ValueError(f"the firmware speaks {SPEEDS[0]} or {SPEEDS[1]} baud, not {baud}")
         if baud == self.link.baud:
             return
-        self.request(lib.SG_MSG_BAUD, wire.body("struct sg_mode", mode=SPEEDS.index(baud)), Mode)
+        try:
+            self.request(lib.SG_MSG_BAUD, wire.body("struct sg_mode", mode=SPEEDS.index(baud)), Mode)
+        except NoDeviceError:       # if only the answer was lost, the device is at the new speed by now
+            pass
         self.link.sleep(0.005)
         self.link.set_baud(baud)
         self._decoder.clear()

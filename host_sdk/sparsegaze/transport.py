@@ -14,6 +14,14 @@ from . import registry
 from .control import VirtualControl
 from .errors import DisconnectedError, PortError
 
+# What an operation on a port that went away raises: pyserial's SerialException is an OSError, its select() on a closed
+# handle raises TypeError, and termios.error is neither.
+try:
+    from termios import error as _termios_error
+    _GONE = (OSError, TypeError, _termios_error)
+except ImportError:
+    _GONE = (OSError, TypeError)
+
 WRITE_TIMEOUT_S = 5.0
 RESET_PULSE_S = 0.1             # DTR/RTS released: long enough to recharge the Nano's 100 nF
 READ_SLICES_S = (0.2, 0.02, 0.002)
@@ -44,6 +52,7 @@ class SerialLink:
 
     port, baud   as given
     control      VirtualControl of a virtual Nano, or None
+    reset_s      now() of the latest opening or reset: from then on the bootloader listens for a while
     """
 
     def __init__(self, port, baud=1_000_000, control=None, auto_reset=True):
@@ -52,6 +61,7 @@ class SerialLink:
         self.control = control
         self.auto_reset = auto_reset
         self._serial = self._open()
+        self.reset_s = time.monotonic()
 
     def __enter__(self):
         return self
@@ -77,7 +87,7 @@ class SerialLink:
             self._port().write(data)
         except serial.SerialTimeoutException:
             raise PortError(f"{self.port} takes no data", "is anything behind this port? `sparsegaze list`") from None
-        except (OSError, TypeError) as error:
+        except _GONE as error:
             raise self._gone(error) from None
 
     def set_baud(self, baud):
@@ -86,7 +96,7 @@ class SerialLink:
             if int(baud) != self.baud:
                 self._port().flush()
                 self._port().baudrate = int(baud)
-        except (OSError, ValueError, TypeError) as error:
+        except (ValueError, *_GONE) as error:
             if isinstance(error, ValueError):
                 raise PortError(f"{self.port} cannot do {baud} baud", "use another adapter") from None
             raise self._gone(error) from None
@@ -94,33 +104,22 @@ class SerialLink:
 
     def reset(self):
         """Reset the board into its bootloader. Returns False when this board has no way to be reset from here."""
+        if not self.auto_reset:
+            return False
         if self.control is not None:
-            if not self.auto_reset:
-                return False
             self.control.reset()
-            self.flush_input()
-            return True
-        try:
-            self._port().dtr = False
-            self._port().rts = False
-            self.sleep(RESET_PULSE_S)
-            self._port().dtr = True
-            self._port().rts = True
-        except (OSError, TypeError) as error:
-            if getattr(error, "errno", None) not in (errno.ENOTTY, errno.EINVAL):
-                raise self._gone(error) from None
-            # A pty has no modem lines; what listens behind one takes an opening for the reset.
-            self._serial.close()
-            self._serial = self._open()
+        else:
+            self._pulse()
         self.flush_input()
+        self.reset_s = self.now()
         return True
 
     def flush_input(self):
         """Forget what has arrived and not been read."""
         try:
             self._port().reset_input_buffer()
-        except (OSError, TypeError) as error:
-            if getattr(error, "errno", None) == errno.ENOTTY:
+        except _GONE as error:
+            if _number(error) == errno.ENOTTY:
                 return
             raise self._gone(error) from None
 
@@ -150,8 +149,22 @@ class SerialLink:
             handle.exclusive = True
             handle.open()
             return handle
-        except (OSError, ValueError) as error:
+        except (ValueError, *_GONE) as error:
             raise _open_error(self.port, self.baud, error) from None
+
+    def _pulse(self):
+        try:
+            self._port().dtr = False
+            self._port().rts = False
+            self.sleep(RESET_PULSE_S)
+            self._port().dtr = True
+            self._port().rts = True
+        except _GONE as error:
+            if _number(error) not in (errno.ENOTTY, errno.EINVAL):
+                raise self._gone(error) from None
+            # A pty has no modem lines; what listens behind one takes an opening for the reset.
+            self._serial.close()
+            self._serial = self._open()
 
     def _port(self):
         if self._serial is None:
@@ -171,11 +184,10 @@ class SerialLink:
                 if waiting:
                     data += handle.read(waiting)
             return data
-        except (OSError, TypeError) as error:
+        except _GONE as error:
             raise self._gone(error) from None
 
     def _gone(self, error):
-        # pyserial's SerialException is an OSError; on a closed handle its select() raises TypeError.
         return DisconnectedError(f"{self.port} is gone ({_reason(error)})",
                                  "check the cable, then `sparsegaze list` shows the ports there are")
 
@@ -191,6 +203,7 @@ class LockstepLink(SerialLink):
         self._received = 0
         self._ready = bytearray()
         self._us = control.time().us
+        self.reset_s = self.now()
 
     @property
     def lockstep(self):
@@ -214,13 +227,6 @@ class LockstepLink(SerialLink):
     def set_baud(self, baud):
         self._advance(self._us)
         super().set_baud(baud)
-
-    def reset(self):
-        if not self.auto_reset:
-            return False
-        self.control.reset()
-        self.flush_input()
-        return True
 
     def flush_input(self):
         self._advance(self._us)
@@ -248,9 +254,16 @@ class LockstepLink(SerialLink):
                                     "switch its power on again")
 
 
-def _reason(error):
-    # SerialException carries its cause in its text only.
+def _number(error):
     number = getattr(error, "errno", None)
+    if number is None and error.args and isinstance(error.args[0], int):
+        number = error.args[0]      # termios.error
+    return number
+
+
+def _reason(error):
+    # SerialException often carries its cause in its text only.
+    number = _number(error)
     if number:
         return os.strerror(number)
     return str(error).split("(")[0].strip() or "port is closed"
@@ -258,7 +271,7 @@ def _reason(error):
 
 def _open_error(port, baud, error):
     text = str(error)
-    number = getattr(error, "errno", None)
+    number = _number(error)
     exists = "://" in port or os.path.exists(port) or os.name == "nt"
     if number == errno.ENOENT or "FileNotFoundError" in text or not exists:
         return PortError(f"no such port: {port}", "`sparsegaze list` shows the ports there are")
