@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole main job on a virtual Nano, measured: flash, calibrate, stream; then report.json, demo.png and the bars.
+
+`make demo` calls this after set-up and build. The virtual Nano starts empty: it is flashed through its bootloader, a
+simulated person is calibrated in lockstep (as fast as this machine computes), the power is cycled, and the gaze that the
+device computes is streamed in real time over held-out targets. Exits 1 when a bar is missed, naming it.
+"""
+import argparse
+import csv
+import json
+import shutil
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from demo_picture import draw
+from sparsegaze import calibrate, flash, validate
+from sparsegaze.device import Device
+from sparsegaze.errors import SparsegazeError
+from sparsegaze.transport import open_link
+from sparsegaze.virtual import VirtualNano
+from sparsegaze.wire import lib
+
+CPU_MHZ = 16.0
+FRESH_S, READY_S = 600.0, 240.0     # whole run on a fresh clone, and when set up
+SET_UP_S = 30.0                     # a set-up that took longer than this had something to install or build
+TARGETS, HELD_OUT = 120, 25
+SECTION_INFER, SECTION_FRAME = "0", "5"     # GPIOR0 sections of the firmware: inference, and all work on a frame
+
+
+def main():
+    """Parse the command line, run, report. Returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=1, help="simulated person, parts, noise and targets (default 1)")
+    parser.add_argument("--started", type=float, default=None, help="when `make demo` began, seconds since the epoch")
+    parser.add_argument("--out", type=Path, default=Path("build/demo"), help="folder of the results (default build/demo)")
+    parser.add_argument("--targets", type=int, default=TARGETS, help=f"calibration targets (default {TARGETS})")
+    parser.add_argument("--held-out", type=int, default=HELD_OUT, help=f"validation targets (default {HELD_OUT})")
+    options = parser.parse_args()
+    started = time.time() if options.started is None else options.started
+    setup_s = time.time() - started
+    try:
+        report, calibration, validation = run(options)
+    except SparsegazeError as error:
+        print(f"demo: {error}", file=sys.stderr)
+        return 1
+    report["setup_s"] = round(setup_s, 2)
+    draw(options.out / "demo.png", report, calibration, validation)
+    report["total_s"] = round(time.time() - started, 2)
+    report["bars"] = bars(report)
+    (options.out / "report.json").write_text(json.dumps(calibrate.plain(report), indent=1) + "\n", encoding="utf-8")
+    missed = [bar for bar in report["bars"] if not bar["met"]]
+    for bar in report["bars"]:
+        print(f"  {'ok  ' if bar['met'] else 'MISS'} {bar['name']:32} {bar['value']!s:>22}   bar {bar['bar']}")
+    print(f"{options.out}/report.json, gaze.csv and demo.png written: simulated person {options.seed}, "
+          f"mean error {report['accuracy']['mean_deg']:.2f} deg at {report['stream']['rate_hz']:.0f} Hz")
+    for bar in missed:
+        print(f"demo: bar missed: {bar['name']} is {bar['value']}, needs {bar['bar']}", file=sys.stderr)
+    return 1 if missed else 0
+
+
+def run(options):
+    """Everything but the clock: (report dict, calibrate.Calibration, validate.Validation)."""
+    out, seed = options.out, options.seed
+    out.mkdir(parents=True, exist_ok=True)
+    state = out / "nano"
+    shutil.rmtree(state, ignore_errors=True)
+    say(f"drawing simulated person {seed} and computing the response map of headsets/led2gaze.toml")
+    began = time.time()
+    with VirtualNano(person=seed, unpaced=True, state_dir=state, progress=progress) as nano:
+        map_s = time.time() - began
+        say(f"virtual Nano on {nano.port}: flashing through its bootloader")
+        with open_link(nano.port) as link:
+            flashed = flash.flash_hex(link, progress=progress)
+        say(f"calibrating: {options.targets} targets, in lockstep with the virtual clock")
+        began = time.time()
+        calibration = calibrate.run(nano.port, n_targets=options.targets, seed=seed, n_validation=0, folder=out,
+                                    progress=progress)
+        calibration_s = time.time() - began
+        with Device(nano.port) as device:
+            before = model_crc(device)
+    say(f"power cycled; streaming over {options.held_out} held-out targets in real time")
+    latency_log = out / "latency.csv"
+    with VirtualNano(person=seed, state_dir=state) as nano:
+        with Device(nano.port) as device:
+            after = model_crc(device)
+        nano.control.frames(latency_log)
+        nano.control.markers_clear()
+        validation = validate.run(nano.port, n_targets=options.held_out, seed=seed,
+                                  avoid_deg=calibration.capture.run.plan.target_deg, csv=out / "gaze.csv",
+                                  progress=progress)
+        nano.control.frames(None)
+        sections, counters = nano.control.markers(), nano.control.counters()
+        with Device(nano.port) as device:
+            status = device.status()
+    measured = validation.report()
+    process = calibration.fit.gp.predict(validation.run.frames["features"].astype(float))
+    gp_deg = np.asarray(process[0] if isinstance(process, tuple) else process)
+    accuracy = dict(measured["accuracy"], gp64_mean_deg=validation.error_of(gp_deg).mean_deg)
+    accuracy["data_loss"] = accuracy.pop("data_loss_percent") / 100.0
+    infer, frame = sections[SECTION_INFER], sections[SECTION_FRAME]
+    model = calibration.fit.model
+    report = {
+        "simulated": True, "seed": seed, "headset": "headsets/led2gaze.toml", "map_s": round(map_s, 2),
+        "flash": {"bytes": flashed.bytes, "verified": flashed.verified, "seconds": round(flashed.seconds, 3),
+                  "bootloader": flashed.bootloader, "baud": flashed.baud},
+        "calibration": {"targets": options.targets, "seconds": round(calibration_s, 2),
+                        "fit": calibrate.plain(calibration.fit.report)},
+        "model": {"n_vectors": model.vectors, "crc_host": f"{calibration.upload.crc:08X}", "crc_before": f"{before:08X}",
+                  "crc_device": f"{after:08X}", "bytes": len(model.image)},
+        "stream": measured["stream"], "accuracy": accuracy,
+        "inference": {"cycles": infer.most, "cycles_mean": infer.mean,
+                      "cycles_net": sections[SECTION_INFER + "n"].most if SECTION_INFER + "n" in sections else None},
+        "frame": {"cycles": frame.most, "cycles_mean": frame.mean},
+        "latency_ms": latency(latency_log), "counters": counters,
+        "device": {key: calibrate.plain(getattr(status, key)) for key in
+                   ("late_frames", "late_slots", "tx_dropped", "rx_bad", "rx_overrun", "saturated", "starved", "stack_free")},
+        "notes": measured["notes"],
+    }
+    return report, calibration, validation
+
+
+def model_crc(device):
+    """CRC-32 of the model the device uses, computed afresh on the device over its flash; 0 without one."""
+    info = device.model_info()
+    return 0 if info.active == lib.SG_SLOT_NONE else device.verify(info.active).crc
+
+
+def latency(path):
+    """From the virtual Nano's log, in ms of device time: mean sample time, and last sample, to the last byte's stop bit.
+
+    The log's rows are cycle stamps; a frame's last byte is the last delimiter before the next frame's samples are all in.
+    """
+    with open(path, newline="", encoding="ascii") as file:
+        rows = [(row["event"], int(row["cycle"])) for row in csv.DictReader(file)]
+    last_sample = np.array([cycle for event, cycle in rows if event == "last_sample"])
+    first_release = np.array([cycle for event, cycle in rows if event == "first_release"])
+    sent = np.array([cycle for event, cycle in rows if event == "delimiter"])
+    to_last, to_mean = [], []
+    for begin, end in zip(last_sample[:-1], last_sample[1:]):
+        delimiters = sent[(sent > begin) & (sent <= end)]
+        releases = first_release[first_release < begin]
+        if len(delimiters) == 2 and len(releases):
+            to_last.append(delimiters[-1] - begin)
+            to_mean.append(delimiters[-1] - (releases[-1] + begin) / 2)
+    ms = 1e-3 / CPU_MHZ
+    return {"frames": len(to_last),
+            "mean_sample_to_last_byte": float(np.mean(to_mean)) * ms, "mean_sample_to_last_byte_max": float(np.max(to_mean)) * ms,
+            "last_sample_to_last_byte": float(np.mean(to_last)) * ms, "last_sample_to_last_byte_max": float(np.max(to_last)) * ms}
+
+
+def bars(report):
+    """The bars of the demo: [{name, value, bar, met}]."""
+    stream, accuracy, model = report["stream"], report["accuracy"], report["model"]
+    limit = FRESH_S if report["setup_s"] > SET_UP_S else READY_S
+    gap = abs(accuracy["mean_deg"] - accuracy["gp64_mean_deg"])
+    rows = [
+        ("total_s", report["total_s"], f"<= {limit:.0f}", report["total_s"] <= limit),
+        ("flash.verified", report["flash"]["verified"], "true", report["flash"]["verified"] is True),
+        ("model.n_vectors", model["n_vectors"], ">= 64", model["n_vectors"] >= 64),
+        ("model.crc_device", model["crc_device"], f"= {model['crc_host']} after a power cycle",
+         model["crc_device"] == model["crc_host"] == model["crc_before"]),
+        ("stream.seconds", round(stream["seconds"], 2), ">= 20", stream["seconds"] >= 20),
+        ("stream.rate_hz", round(stream["rate_hz"], 2), ">= 250", stream["rate_hz"] >= 250),
+        ("stream.lost", stream["lost"] + stream["torn"], "0", stream["lost"] + stream["torn"] == 0),
+        ("stream.bit_identical", stream["bit_identical"], "true", stream["bit_identical"] is True),
+        ("accuracy.mean_deg", round(accuracy["mean_deg"], 3), "<= 1.0", accuracy["mean_deg"] <= 1.0),
+        ("|mean_deg - gp64_mean_deg|", round(gap, 4), "<= 0.05", gap <= 0.05),
+    ]
+    return [{"name": name, "value": value, "bar": bar, "met": bool(met)} for name, value, bar, met in rows]
+
+
+def say(text):
+    """A line of progress on stderr."""
+    print(f"== {text}", file=sys.stderr, flush=True)
+
+
+_last = {"stage": None, "tenth": -1}
+
+
+def progress(stage, done, total):
+    """A stage's progress on stderr: one line a stage on a log, updated in place on a terminal."""
+    tenth = int(10 * done / total) if total else 10
+    if (stage, tenth) == (_last["stage"], _last["tenth"]):
+        return
+    _last.update(stage=stage, tenth=tenth)
+    if sys.stderr.isatty():
+        sys.stderr.write(f"\r   {stage:12} {'#' * tenth}{'.' * (10 - tenth)}" + ("\n" if tenth >= 10 else ""))
+    elif tenth >= 10:
+        sys.stderr.write(f"   {stage} done\n")
+    sys.stderr.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
