@@ -82,8 +82,8 @@ def _probe(port):
               show_default=True, help="Light from outside.")
 @click.option("--light", type=click.Choice(["nominal", "dim", "bright"]), default="nominal", show_default=True,
               help="Photocurrent of the LEDs: 200, 75 or 600 nA on average.")
-@click.option("--bootloader", type=click.Choice(["optiboot", "old"]), default="optiboot", show_default=True,
-              help="Stock bootloader of the board: Optiboot (115200 baud) or the older one (57600).")
+@click.option("--bootloader", type=click.Choice(["optiboot", "atmegaboot"]), default="optiboot", show_default=True,
+              help="Stock bootloader of the board: Optiboot (115200 baud) or the older ATmegaBOOT (57600).")
 @click.option("--state", type=click.Path(file_okay=False), help="Folder that keeps flash and EEPROM between runs.")
 @click.option("--link", type=click.Path(), help="Also make a symbolic link to the port, for a name that stays.")
 @json_option
@@ -104,14 +104,13 @@ def virtual(headset, person, unpaced, no_reset, ambient, light, bootloader, stat
                "bootloader": bootloader, "state_dir": state, "link": link}
     if headset:
         options["headset"] = headset
-    with console.progress() as progress:
-        nano = VirtualNano(progress=progress, **options)
-        nano.__enter__()
+    console.note("preparing the simulated person (the first time takes longer)")
+    nano = VirtualNano(**options)
     try:
         console.result({"port": str(link or nano.port), "pty": nano.port, "pid": nano.pid, "person": person,
                         "unpaced": unpaced}, str(link or nano.port))
         console.note("virtual Nano running; Ctrl-C stops it")
-        while nano.alive():
+        while nano.alive:
             time.sleep(0.2)
     except KeyboardInterrupt:
         return 0        # the ordinary way to stop it
