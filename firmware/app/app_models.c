@@ -158,10 +158,10 @@ int8_t app_trial_write(const struct sg_model_data *data)
         return SG_E_ARG;
     if (data->offset > (uint16_t)HAL_TRIAL_BYTES || data->length > (uint16_t)HAL_TRIAL_BYTES - data->offset)
         return SG_E_BOUNDS;
-    if (active == SG_SLOT_RAM)
-        return SG_E_STATE;
     if (check.at && check.slot == SG_SLOT_RAM)
         return SG_E_BUSY;
+    if (active == SG_SLOT_RAM)
+        active = stored;        // a model in use never changes
     memcpy(trial + data->offset, data->data, data->length);
     forget(SG_SLOT_RAM, SG_E_STATE);            // not checked since
     return SG_OK;

@@ -3,7 +3,7 @@
 //
 //   slot + 0      OCR1A    the other five light; ~5 us later the charged cathode is released, the release instant is
 //                          read from TCNT1, and OCR1B is set to release + exposure
-//   + exposure    OCR1B    hardware starts the ADC; sample-and-hold closes 256 cycles later. No code is involved
+//   + exposure    OCR1B    hardware starts the ADC; sample-and-hold closes 260 cycles later. No code is involved
 //   + 8 cycles    OCR1A    lights out; the next LED's cathode is driven high
 //   + 92 us       ADC      code read; a throw-away conversion of the next channel charges the sample capacitor
 //                          to Vcc through that cathode
@@ -15,8 +15,9 @@ enum {
     PORTD_DARK = 1 << PD0,          // pull-up on the UART's input
     DDRD_ALL = 0xFC,
     DDRC_ALL = 0x3F,
-    // OCR1B match to the closing of sample-and-hold: two ADC clocks of 128 cycles after a trigger.
-    SAMPLE_CYCLES = 256,
+    // TCNT1 = OCR1B to the closing of sample-and-hold: the flag rises one cycle after the match, three cycles go into
+    // synchronisation (datasheet, ADC auto triggering), then two ADC clocks of 128 cycles.
+    SAMPLE_CYCLES = 1 + 3 + 2 * 128,
     // Release (the OUT to PORTC) to the TCNT1 value that the LDS after it returns.
     RELEASE_READ_CYCLES = 1,
     EXPOSURE_FIXED_CYCLES = SAMPLE_CYCLES + RELEASE_READ_CYCLES,

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Virtual Nanos that hold the firmware under test, and models to put into them."""
+
+import subprocess
+
+import numpy as np
+import pytest
+
+from sparsegaze.device import Device
+from sparsegaze.mapfile import synthetic_map
+from sparsegaze.model import CHANNELS, SLOT_BYTES, DeviceModel
+
+FLASH_BYTES = 32768
+SLOT_BASE = (0x6000, 0x6C00)
+
+
+def random_model(vectors, seed=0, generation=1, channels=CHANNELS):
+    """A model whose every field is drawn from `seed`; no gaze behind it, but every path of the arithmetic is used.
+
+    Its inputs span features 30000 .. 40000 about.
+    """
+    rng = np.random.default_rng(seed)
+    return DeviceModel.from_parts(
+        offset=rng.integers(30000, 31000, channels), gain_q12=rng.integers(1500, 1700, channels),
+        bias=rng.integers(-2**28, 2**28, 2), trend=rng.integers(-2**15, 2**15, (2, channels)),
+        centres=rng.integers(0, 256, (vectors, channels)), weights=rng.integers(-6000, 6000, (vectors, 2)),
+        weight_frac_bits=8, generation=generation,
+        guards=[(-2**18, 2**18, rng.integers(-60, 60, channels)) for _ in range(3)])
+
+
+def random_features(n, seed=0):
+    """[n, 6] features: most inside the span of random_model, some at its edges, some anywhere."""
+    rng = np.random.default_rng(seed)
+    inside = rng.integers(31000, 40500, (n, CHANNELS))
+    anywhere = rng.integers(0, 65536, (n, CHANNELS))
+    return np.where(rng.random((n, 1)) < 0.8, inside, anywhere).astype(np.uint16)
+
+
+def put_models(state_dir, images):
+    """Prepare the flash of a virtual Nano that starts with `state_dir`: {slot: image bytes}, the rest erased."""
+    flash = bytearray(b"\xff" * FLASH_BYTES)
+    for slot, image in images.items():
+        assert len(image) <= SLOT_BYTES
+        flash[SLOT_BASE[slot]:SLOT_BASE[slot] + len(image)] = image
+    state_dir.mkdir(parents=True, exist_ok=True)
+    (state_dir / "flash.bin").write_bytes(flash)
+
+
+@pytest.fixture(scope="session")
+def any_map(tmp_path_factory):
+    """A response map without optics."""
+    return synthetic_map(str(tmp_path_factory.mktemp("map") / "synthetic.sgmap"))
+
+
+@pytest.fixture
+def board(virtual_nano, firmware_elf, any_map, tmp_path):
+    """Factory: board(models={slot: image}, **options) -> (VirtualNano, Device), unpaced, firmware in flash.
+
+    nano.control.lockstep is on: nothing passes but what the test lets pass.
+    """
+    devices = []
+
+    def start(models=None, **options):
+        options.setdefault("app", firmware_elf)
+        options.setdefault("state_dir", tmp_path / "state")
+        if models is not None:
+            put_models(options["state_dir"], models)
+        nano = virtual_nano(map=any_map, unpaced=True, person=1, **options)
+        device = Device(nano.port)
+        devices.append(device)
+        return nano, device
+
+    yield start
+    for device in devices:
+        device.close()
+
+
+@pytest.fixture(scope="session")
+def avr_tools(repo_root):
+    """The folder of the AVR compiler that builds the firmware."""
+    folder = repo_root / ".pio-offline" / "packages" / "toolchain-atmelavr" / "bin"
+    assert (folder / "avr-gcc").exists(), "run make firmware first"
+    return folder
+
+
+@pytest.fixture(scope="session")
+def port_with(repo_root, avr_tools, tmp_path_factory):
+    """Factory: the ATmega328P port with another application; port_with(source) -> path of the ELF."""
+
+    def build(source, *flags):
+        out = tmp_path_factory.mktemp("elf") / (source.stem + ".elf")
+        firmware = repo_root / "firmware"
+        subprocess.run(
+            [avr_tools / "avr-gcc", "-mmcu=atmega328p", "-DF_CPU=16000000L", "-std=gnu11", "-O2", "-Wall", "-Wextra",
+             "-Werror", *flags, *[f"-I{firmware / part}" for part in ("core", "app", "ports/avr328p")], source,
+             firmware / "core" / "sg_wire.c", *sorted((firmware / "ports" / "avr328p").glob("*.c")), "-o", out], check=True)
+        return out
+
+    return build
+
+
+def collect(device, n, timeout_s=2.0):
+    """The next n stream frames."""
+    frames = []
+    for frame in device.frames(timeout_s):
+        frames.append(frame)
+        if len(frames) == n:
+            return frames
+    raise AssertionError(f"the stream ended after {len(frames)} of {n} frames")

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models on the device: bit identity with the host's core, the store, the RAM trial, the recentre offset."""
+
+import zlib
+
+import numpy as np
+import pytest
+
+from conftest import collect, random_features, random_model
+from sparsegaze.errors import DeviceError
+from sparsegaze.model import DeviceModel
+from sparsegaze.wire import lib
+
+GOLDEN_CRC = None
+
+
+def host_gaze(model, features, recentre_deg=(0.0, 0.0)):
+    """[n, 3] integers azimuth, elevation (1/128 deg) and flags, as the host's core computes them."""
+    az_deg, el_deg, flags = model.predict(features, recentre_deg)
+    return np.stack([np.asarray(az_deg) * 128, np.asarray(el_deg) * 128, flags], 1).astype(np.int32)
+
+
+def device_gaze(device, features):
+    found = device.infer(features)
+    return np.stack([found.azimuth_deg * 128, found.elevation_deg * 128, found.flags], 1).astype(np.int32)
+
+
+def test_infer_is_bit_identical_to_the_host_core(board):
+    crc = {}
+    features = random_features(300)
+    for vectors in (1, 64, 216):
+        model = random_model(vectors, seed=vectors)
+        _, device = board(models={1: model.image})
+        expected, found = host_gaze(model, features), device_gaze(device, features)
+        device.close()
+        assert len({tuple(row) for row in expected.tolist()}) > 200     # the vectors are worth something
+        np.testing.assert_array_equal(found, expected)
+        crc[vectors] = zlib.crc32(found.astype("<i4").tobytes())
+    print("infer crc32 " + " ".join(f"n={n}:{value:08x}" for n, value in crc.items()))
+    assert crc == GOLDEN_CRC
+
+
+def test_streamed_gaze_is_what_the_host_computes_from_the_raw_frame(board):
+    model = random_model(64)
+    nano, device = board(models={0: model.image})
+    device.recentre((1.5, -2.25))
+    device.set_stream(raw=True, gaze=True)
+    nano.control.set("light", "bright")             # exposures change on the way
+    frames = collect(device, 300)
+    assert {frame.raw.model_crc for frame in frames} == {model.crc}
+    for frame in frames:
+        raw, gaze = frame.raw, frame.gaze
+        (az, el, flags), = host_gaze(model, np.array([raw.feature]), (raw.recentre_az_deg_q7 / 128, raw.recentre_el_deg_q7 / 128))
+        flags |= raw.flags
+        if raw.flags & (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED):
+            flags &= ~lib.SG_FLAG_VALID
+        assert (gaze.azimuth_deg_q7, gaze.elevation_deg_q7, gaze.flags) == (az, el, flags)
+        assert gaze.t_us == raw.t_us
+    assert any(frame.raw.flags & lib.SG_FLAG_EXPOSURE for frame in frames)
+
+
+@pytest.mark.parametrize("a, b, active", [(1, 2, 1), (2, 1, 0), (0xFFFFFFFF, 0, 1), (0, 0xFFFFFFFF, 0), (7, 7, 0)],
+                         ids=["newer_in_b", "newer_in_a", "wrapped_in_b", "wrapped_in_a", "equal_keeps_a"])
+def test_the_newer_generation_is_used(board, a, b, active):
+    models = {0: random_model(10, seed=1, generation=a), 1: random_model(10, seed=2, generation=b)}
+    _, device = board(models={slot: model.image for slot, model in models.items()})
+    info = device.model_info()
+    assert info.active == active and info.verdict == (0, 0, lib.SG_E_MAGIC)
+    assert info.crc[:2] == (models[0].crc, models[1].crc) and info.generation[:2] == (a, b)
+    assert device.read_model() == models[active].image
+
+
+def test_a_damaged_slot_is_passed_over_and_named(board):
+    good, newer = random_model(12, seed=1, generation=1), bytearray(random_model(12, seed=2, generation=9).image)
+    newer[300] ^= 1
+    _, device = board(models={0: good.image, 1: bytes(newer)})
+    info = device.model_info()
+    assert info.active == 0 and info.verdict[1] == lib.SG_E_CRC and info.crc[1] == 0
+    verdict = device.verify(1)
+    assert verdict.verdict == lib.SG_E_CRC and verdict.crc == zlib.crc32(bytes(newer)[8:])
+
+
+def test_verify_computes_the_crc_afresh_without_a_late_frame(board):
+    model = random_model(64)
+    _, device = board(models={0: model.image})
+    device.set_stream(raw=True, gaze=True)
+    verdict = device.verify(0)
+    assert (verdict.verdict, verdict.crc, verdict.slot) == (0, model.crc, 0)
+    assert device.verify(1).verdict == lib.SG_E_MAGIC
+    status = device.status()
+    assert status.late_frames == 0 and status.late_slots == 0
+
+
+def test_without_a_model_gaze_is_never_valid(board):
+    _, device = board()
+    device.set_stream(raw=True, gaze=True)
+    for frame in collect(device, 20):
+        assert frame.raw.model_crc == 0
+        assert frame.gaze.flags & lib.SG_FLAG_NO_MODEL and not frame.gaze.valid
+    assert set(device.infer(random_features(3)).flags) == {lib.SG_FLAG_NO_MODEL}
+
+
+def test_a_trial_model_is_used_from_ram_until_left_or_reset(board):
+    stored, trial = random_model(64, seed=1), random_model(48, seed=2)
+    features = random_features(50)
+    _, device = board(models={0: stored.image})
+    verdict = device.trial(trial.image)
+    assert (verdict.crc, verdict.slot) == (trial.crc, lib.SG_SLOT_RAM)
+    expected = host_gaze(trial, features)
+    expected[:, 2] |= lib.SG_FLAG_TRIAL
+    np.testing.assert_array_equal(device_gaze(device, features), expected)
+    assert device.status().active == lib.SG_SLOT_RAM and device.read_model(lib.SG_SLOT_RAM) == trial.image
+    device.set_stream(raw=True, gaze=True)
+    frame = collect(device, 1)[0]
+    assert frame.raw.flags & lib.SG_FLAG_TRIAL and frame.raw.model_crc == trial.crc
+    device.set_stream()
+
+    back = device.trial(None)
+    assert (back.crc, back.slot) == (stored.crc, 0)
+    np.testing.assert_array_equal(device_gaze(device, features), host_gaze(stored, features))
+    device.trial(trial.image)
+    device.reboot()
+    assert device.status().active == 0
+
+
+def test_writing_a_trial_leaves_the_one_in_use_before_it_changes(board):
+    stored, trial = random_model(20, seed=1), random_model(20, seed=2)
+    _, device = board(models={1: stored.image})
+    device.trial(trial.image)
+    device.request(lib.SG_MSG_TRIAL_WRITE, b"\x10\0\2\1\xff")
+    info = device.model_info()
+    assert info.active == 1 and info.verdict[lib.SG_SLOT_RAM] == lib.SG_E_STATE
+
+
+@pytest.mark.parametrize("at, error", [(300, lib.SG_E_CRC), (0, lib.SG_E_MAGIC), (96, lib.SG_E_VERSION), (98, lib.SG_E_BOUNDS)],
+                         ids=["record_flipped", "magic", "version", "vectors"])
+def test_a_bad_trial_is_refused_and_the_stored_model_stays_in_use(board, at, error):
+    stored, damaged = random_model(20, seed=1), bytearray(random_model(20, seed=2).image)
+    damaged[at] ^= 0x40
+    _, device = board(models={0: stored.image})
+    with pytest.raises(DeviceError) as caught:
+        device.trial(bytes(damaged))
+    assert caught.value.code == error
+    info = device.model_info()
+    assert info.active == 0 and info.verdict[lib.SG_SLOT_RAM] == error
+
+
+def test_recentre_belongs_to_its_model_and_survives_a_restart(board):
+    stored, trial = random_model(64, seed=1), random_model(30, seed=2)
+    features = random_features(20)
+    nano, device = board(models={0: stored.image})
+    device.recentre((2.5, -1.0))
+    moved = host_gaze(stored, features, (2.5, -1.0))
+    np.testing.assert_array_equal(device_gaze(device, features), moved)
+
+    device.trial(trial.image)
+    assert device.recentre().azimuth_deg == 0       # another model, another offset
+    device.trial(None)
+    assert (device.recentre().azimuth_deg, device.recentre().elevation_deg) == (2.5, -1.0)
+
+    device.link.sleep(0.5)                          # EEPROM takes 3.4 ms a byte
+    nano.control.power(False)
+    nano.control.power(True)
+    device.connect()
+    np.testing.assert_array_equal(device_gaze(device, features), moved)
+    device.recentre(clear=True)
+    device.reboot()                                 # waits for the EEPROM by itself
+    np.testing.assert_array_equal(device_gaze(device, features), host_gaze(stored, features))
+
+
+def test_a_recentre_offset_saturates_instead_of_wrapping(board):
+    model = random_model(64)
+    _, device = board(models={0: model.image})
+    device.recentre((255, -255))
+    features = random_features(50)
+    np.testing.assert_array_equal(device_gaze(device, features), host_gaze(model, features, (255, -255)))
+
+
+def test_model_images_are_exactly_what_was_stored(board):
+    model = random_model(216)
+    _, device = board(models={0: model.image})
+    assert DeviceModel(device.read_model(0)).image == model.image
