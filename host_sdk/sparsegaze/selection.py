@@ -75,7 +75,9 @@ def blinks(features, noise=None):
     if steady.sum() < LEAST_SHARE * n:
         return np.ones(n, bool)
     centre, spread = _shortest_half(x[steady])
-    level = np.abs(x - centre) > np.maximum(LEVEL_SIGMAS * np.maximum(spread, noise), LEVEL_FLOOR)
+    # A blink widens the densest half too; a resting eye never does by more than twice the floor.
+    spread = np.maximum(noise, np.minimum(spread, 2 * LEVEL_FLOOR / LEVEL_SIGMAS))
+    level = np.abs(x - centre) > np.maximum(LEVEL_SIGMAS * spread, LEVEL_FLOOR)
     # One noisy frame is no blink; a lid moves several frames, and only those are widened.
     far = level.any(axis=1)
     padded = np.r_[False, far, False]

@@ -40,7 +40,7 @@ class Recorded:
         since = (self.t_us - begin) * 1e-6
         shut = np.clip(np.minimum(since / 0.06, (length_s - since) / 0.14), 0, 1)
         self.features += shut[:, None] * octaves * 4096 * np.array([1, 0.8, 1.2, 0.5, -0.3, 0.9])
-        self.blinking |= shut * octaves * 1.2 > 0.03     # less is a degree or two, and far below any real lid
+        self.blinking |= shut * octaves * 1.2 > 0.045     # less is a degree or two, and far below any real lid
 
     def select(self):
         return selection.select(self.t_us, np.clip(self.features, 0, 65535).astype(np.uint16), self.flagged, self.index,
