@@ -58,13 +58,13 @@ def rounded(x):
 
 
 def exp_table():
-    """[(level Q0.16, drop to the next level Q10.6)] for 2^-(i/64), i = 0..1023.
+    """[(drop to the next level Q10.6, level Q0.16)] for 2^-(i/64), i = 0..1023.
 
     The chord lies above the curve and the device floors the interpolated drop: both means are taken off the
     nodes, which halves the worst error."""
     step = math.log(2.0) / 64
     level = [math.floor(65536 * 2.0 ** (-i / 64) * (1 - step * step / 16)) for i in range(1025)]
-    return [(level[i], 64 * (level[i] - level[i + 1])) for i in range(1024)]
+    return [(64 * (level[i] - level[i + 1]), level[i]) for i in range(1024)]
 
 
 def rows(values, per_row=12):

@@ -46,30 +46,30 @@ int sg_gp_predict(const struct sg_model_view *view, const uint16_t feature[6], i
                   uint8_t *flags)
 {
     const uint8_t *image = view->image;
-    uint16_t s[SG_MODEL_CHANNELS] = { 0 };
-    uint32_t sum_s2 = 0;
-    uint32_t acc[2];
+    struct sg_gp_sum sum = { .s2 = 0 };
     uint8_t seen = 0;
 
-    acc[0] = sg_rom_u32(image + offsetof(struct sg_model_head, bias), view->space);
-    acc[1] = sg_rom_u32(image + offsetof(struct sg_model_head, bias) + 4, view->space);
+    sum.acc[0] = sg_rom_u32(image + offsetof(struct sg_model_head, bias), view->space);
+    sum.acc[1] = sg_rom_u32(image + offsetof(struct sg_model_head, bias) + 4, view->space);
     for (uint8_t j = 0; j < view->channels; j++) {
         const uint8_t *channel = image + 2U * j;
         const uint8_t *trend = image + offsetof(struct sg_model_head, trend) + 4U * j;
         const uint16_t offset = sg_rom_u16(channel + offsetof(struct sg_model_head, offset), view->space);
         const uint16_t gain_q12 = sg_rom_u16(channel + offsetof(struct sg_model_head, gain_q12), view->space);
-        s[j] = scaled(feature[j], offset, gain_q12, &seen);
-        sum_s2 += (uint32_t)s[j] * s[j];
-        acc[0] += sg_rom_u32(trend, view->space) * s[j];
-        acc[1] += sg_rom_u32(trend + 4 * SG_MODEL_CHANNELS, view->space) * s[j];
+        const uint16_t s = scaled(feature[j], offset, gain_q12, &seen);
+        sum.s_u8q4[j] = s;
+        sum.s2 += (uint32_t)s * s;
+        sum.acc[0] += sg_rom_u32(trend, view->space) * s;
+        sum.acc[1] += sg_rom_u32(trend + 4 * SG_MODEL_CHANNELS, view->space) * s;
     }
-    seen |= guarded(view, s);
-    sg_gp_loop(acc, image + SG_MODEL_HEAD_BYTES, s, sum_s2 >> 5, view->vectors, view->space);
+    sum.s2 >>= 5;
+    seen |= guarded(view, sum.s_u8q4);
+    sg_gp_loop(&sum, image + SG_MODEL_HEAD_BYTES, view->vectors, view->space);
 
     int result = SG_OK;
     for (uint8_t i = 0; i < 2; i++) {
         // Q.(weight_frac_bits + 16) -> Q8.7
-        const int32_t deg = sg_q_round_shift(sg_q_signed32(acc[i]), (uint8_t)(view->weight_frac_bits + 9U));
+        const int32_t deg = sg_q_round_shift(sg_q_signed32(sum.acc[i]), (uint8_t)(view->weight_frac_bits + 9U));
         deg_q7[i] = sg_q_sat16(deg);
         if (deg_q7[i] != deg) {
             seen = SG_GP_OUT_OF_RANGE;

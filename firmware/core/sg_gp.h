@@ -33,10 +33,10 @@ enum sg_gp_flag { SG_GP_OUT_OF_RANGE = 4 };
 //   calibrated range. Outside of it the point is flagged. The result is the accumulator >> (weight_frac_bits
 //   + 9). The order of the vectors does not matter, to the bit.
 // Accuracy
-//   |k - 2^16 exp(-T/(16 u^2))| <= 1.5 LSB for the T of this function: level 1/2, floor of the interpolation 1/2,
-//   half the chord's height 0.48, the means of the last two being taken off the table. S2 being floored adds
-//   0.7. So the mean is within 2.2 * 2^-16 * sum_i |weight_i| + 2^-8 deg of the real-number mean at the same s.
-//   tests/unit/test_core_gp.py asserts the bound and prints it beside the worst error seen.
+//   |k - 2^16 exp(-T/(16 u^2))| <= 1.5 LSB for the T of this function: level 1/2, floor of the interpolation
+//   1/2, half the chord's height 0.48, the means of the last two being taken off the table. S2 being floored
+//   adds 0.7. So the mean is within 2.2 * 2^-16 * sum_i |weight_i| + 2^-8 deg of the real-number mean at the
+//   same s. tests/unit/test_core_gp.py asserts the bound and prints it beside the worst error seen.
 // Cost       O(n d), constant time for given n, d, guards up to the clamps; cycles per target in
 //            tests/budget.csv.
 // Returns    SG_OK, or SG_E_RANGE if the result saturated (*deg_q7 then holds the saturated value, flags are

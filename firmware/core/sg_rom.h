@@ -10,6 +10,11 @@
 
 enum sg_rom_space { SG_ROM_MEMORY = 0, SG_ROM_FLASH = 1 };
 
+// sg_gp has an assembly twin of its inner loop for AVR; SG_GP_PORTABLE asks for the C one there too.
+#if defined(__AVR__) && !defined(SG_GP_PORTABLE)
+#define SG_GP_ASSEMBLY
+#endif
+
 #ifdef __AVR__
 #include <avr/pgmspace.h>
 #define SG_ROM PROGMEM
