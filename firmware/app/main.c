@@ -102,7 +102,6 @@ void app_on_frame(const struct hal_frame *frame)
     struct sg_raw raw = { .t_us = frame->t_us, .span_us = frame->span_us };
     struct sg_gaze gaze;
 
-    HAL_BEGIN(HAL_SECTION_FRAME);
     HAL_BEGIN(HAL_SECTION_FEATURE);
     raw.flags = sg_track_features(frame->code, frame->exposure_cycles, raw.feature);
     HAL_END(HAL_SECTION_FEATURE);
@@ -128,7 +127,6 @@ void app_on_frame(const struct hal_frame *frame)
     if (app.exposure_auto)
         expose_next(frame);
     app_live_frame();
-    HAL_END(HAL_SECTION_FRAME);
 }
 
 void app_describe(struct sg_hello *hello)

@@ -19,7 +19,7 @@ enum hal_section {
     HAL_SECTION_OUTPUT = 2,     // encode and queue
     HAL_SECTION_SENSE = 3,      // sensing interrupts
     HAL_SECTION_SERIAL = 4,     // UART interrupts
-    HAL_SECTION_FRAME = 5,      // the whole frame in the main loop
+    HAL_SECTION_FRAME = 5,      // all of a frame in the main loop, from taking its samples on
 };
 
 #define HAL_BEGIN(section) (GPIOR0 = (uint8_t)(2 * (section) + 1))

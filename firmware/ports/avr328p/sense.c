@@ -216,6 +216,7 @@ uint8_t sense_take(struct hal_frame *frame)
 
     if (!ready)
         return 0;
+    HAL_BEGIN(HAL_SECTION_FRAME);
     ATOMIC_BLOCK(ATOMIC_FORCEON) {      // ~15 us: within what the UART's two-byte buffer bridges at 1 Mbaud
         const struct raw_frame *raw = &buffer[ready - 1];
         first = raw->slot[0].release;
@@ -246,6 +247,7 @@ void sense_taken(void)
     ATOMIC_BLOCK(ATOMIC_FORCEON) {
         late_frames += ready != 0;
     }
+    HAL_END(HAL_SECTION_FRAME);
 }
 
 void sense_report(struct sg_status *status)
