@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Write the constant tables of the core: sg_gp_table.c and sg_expose_table.h, beside this script.
+"""Write the constant tables of the core: sg_gp_table.c, sg_expose_table.h, sg_crc32_table.h.
 
-    python3 firmware/core/make_tables.py            write both files
+    python3 firmware/core/make_tables.py            write them beside this script
     python3 firmware/core/make_tables.py --check    exit 1 if a committed file differs
 """
 import math
@@ -112,11 +112,26 @@ def expose_table():
             "\n#endif\n")
 
 
+def crc32_table():
+    """Text of sg_crc32_table.h: CRC-32 (IEEE 802.3, reflected) of every byte."""
+    values = []
+    for byte in range(256):
+        crc = byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xEDB88320 if crc & 1 else 0)
+        values.append(f"0x{crc:08X}")
+    return (LICENSE + MADE_BY + "#ifndef SG_CRC32_TABLE_H\n#define SG_CRC32_TABLE_H\n\n"
+            '#include <stdint.h>\n\n#include "sg_rom.h"\n\n'
+            "static const uint32_t crc32_table[256] SG_ROM = {\n" + rows(values, 8) + "};\n\n#endif\n")
+
+
 def main(argv):
     """Write or check; returns the exit code."""
     here = os.path.dirname(os.path.abspath(__file__))
     stale = []
-    for name, text in (("sg_gp_table.c", gp_table()), ("sg_expose_table.h", expose_table())):
+    tables = {"sg_gp_table.c": gp_table, "sg_expose_table.h": expose_table, "sg_crc32_table.h": crc32_table}
+    for name, make in tables.items():
+        text = make()
         path = os.path.join(here, name)
         if argv == ["--check"]:
             with open(path, encoding="utf-8") as file:

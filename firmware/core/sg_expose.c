@@ -4,13 +4,13 @@
 #include "sg_expose_table.h"
 #include "sg_rom.h"
 
-// Value between a table entry and the next, Q4.12, rounded half up. fraction < 2^bits <= 512 and neighbours
-// differ by less than 128: the product has 17 bits with its sign.
-static uint16_t interpolated_q12(const uint16_t *entry, uint16_t fraction, uint8_t bits)
+// Value between an entry of a rising table and the next, Q4.12, rounded half up. fraction < 2^bits <= 512 and
+// neighbours differ by at most 92: the product fits 16 bits unsigned.
+static inline uint16_t interpolated_q12(const uint16_t *entry, uint16_t fraction, uint8_t bits)
 {
     const uint16_t here = sg_rom_word(entry);
-    const int32_t slope = (int32_t)sg_rom_word(entry + 1) - here;
-    return (uint16_t)(here + ((slope * fraction + (1L << (bits - 1U))) >> bits));
+    const uint16_t rise = (uint16_t)(sg_rom_word(entry + 1) - here);
+    return (uint16_t)(here + ((uint16_t)((uint16_t)(rise * fraction) + (1U << (bits - 1U))) >> bits));
 }
 
 // 4096 * log2(x), x in 1..32767.

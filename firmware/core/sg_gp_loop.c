@@ -18,20 +18,33 @@ static uint16_t kernel_q16(uint32_t t)
     return (uint16_t)(level_q16 - (uint16_t)(((uint32_t)drop_q6 * fraction_q10) >> 16));
 }
 
-void sg_gp_loop(struct sg_gp_sum *sum, const uint8_t *record, uint8_t n, uint8_t space)
+static inline void accumulate(struct sg_gp_sum *sum, const uint8_t *record, uint8_t n, uint8_t space)
 {
+    uint32_t acc_azimuth = sum->acc[0];
+    uint32_t acc_elevation = sum->acc[1];
     for (; n != 0; n--) {
-        const uint32_t half_c2 = sg_rom_u16(record, space) + ((uint32_t)sg_rom_byte(record + 2, space) << 16);
+        const uint32_t half_c2 = sg_rom_u16(record, space) | ((uint32_t)sg_rom_byte(record + 2, space) << 16);
         int32_t t = (int32_t)(sum->s2 + half_c2);
         for (uint8_t j = 0; j < SG_MODEL_CHANNELS; j++)
-            t -= (int32_t)((uint32_t)sum->s_u8q4[j] * sg_rom_byte(record + 3 + j, space));
+            t -= (int32_t)((uint32_t)sum->s_u8q4[j] * (uint16_t)sg_rom_byte(record + 3 + j, space));
         const uint16_t k_q16 = kernel_q16(t < 0 ? 0UL : (uint32_t)t);
         const int16_t weight_azimuth = (int16_t)sg_rom_u16(record + 9, space);
         const int16_t weight_elevation = (int16_t)sg_rom_u16(record + 11, space);
-        sum->acc[0] += (uint32_t)(int32_t)weight_azimuth * k_q16;
-        sum->acc[1] += (uint32_t)(int32_t)weight_elevation * k_q16;
+        acc_azimuth += (uint32_t)(int32_t)weight_azimuth * k_q16;
+        acc_elevation += (uint32_t)(int32_t)weight_elevation * k_q16;
         record += SG_MODEL_RECORD_BYTES;
     }
+    sum->acc[0] = acc_azimuth;
+    sum->acc[1] = acc_elevation;
+}
+
+void sg_gp_loop(struct sg_gp_sum *sum, const uint8_t *record, uint8_t n, uint8_t space)
+{
+    // Two loops, so that no byte asks again where it comes from.
+    if (space == SG_ROM_FLASH)
+        accumulate(sum, record, n, SG_ROM_FLASH);
+    else
+        accumulate(sum, record, n, SG_ROM_MEMORY);
 }
 
 #endif

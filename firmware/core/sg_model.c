@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "sg_model.h"
 
+#include "sg_crc32_table.h"
 #include "sg_err.h"
 #include "sg_rom.h"
 
@@ -11,18 +12,7 @@
 
 static uint32_t crc32_byte(uint32_t crc, uint8_t byte)
 {
-    // Four bits at a time: 64 bytes of table instead of 1 KiB.
-    static const uint16_t nibble[32] SG_ROM = {
-        0x0000, 0x0000, 0x1064, 0x1DB7, 0x20C8, 0x3B6E, 0x30AC, 0x26D9, 0x4190, 0x76DC, 0x51F4,
-        0x6B6B, 0x6158, 0x4DB2, 0x713C, 0x5005, 0x8320, 0xEDB8, 0x9344, 0xF00F, 0xA3E8, 0xD6D6,
-        0xB38C, 0xCB61, 0xC2B0, 0x9B64, 0xD2D4, 0x86D3, 0xE278, 0xA00A, 0xF21C, 0xBDBD,
-    };
-    crc ^= byte;
-    for (uint8_t half = 0; half < 2; half++) {
-        const uint16_t *entry = &nibble[((uint8_t)crc & 15U) * 2U];
-        crc = (crc >> 4) ^ sg_rom_word(entry) ^ ((uint32_t)sg_rom_word(entry + 1) << 16);
-    }
-    return crc;
+    return (crc >> 8) ^ sg_rom_dword(&crc32_table[(uint8_t)crc ^ byte]);
 }
 
 uint32_t sg_model_crc32_at(uint32_t crc, const uint8_t *data, uint16_t n, uint8_t space)

@@ -24,9 +24,26 @@ static inline uint8_t sg_rom_byte(const uint8_t *p, uint8_t space)
     return space == SG_ROM_FLASH ? pgm_read_byte(p) : *p;
 }
 
-static inline uint16_t sg_rom_word(const uint16_t *table_entry)
+// Little-endian fields at any alignment.
+static inline uint16_t sg_rom_u16(const uint8_t *p, uint8_t space)
 {
-    return pgm_read_word(table_entry);
+    return space == SG_ROM_FLASH ? pgm_read_word(p) : *(const uint16_t *)p;
+}
+
+static inline uint32_t sg_rom_u32(const uint8_t *p, uint8_t space)
+{
+    return space == SG_ROM_FLASH ? pgm_read_dword(p) : *(const uint32_t *)p;
+}
+
+// An entry of a table of the core.
+static inline uint16_t sg_rom_word(const uint16_t *entry)
+{
+    return pgm_read_word(entry);
+}
+
+static inline uint32_t sg_rom_dword(const uint32_t *entry)
+{
+    return pgm_read_dword(entry);
 }
 #else
 #define SG_ROM
@@ -37,21 +54,26 @@ static inline uint8_t sg_rom_byte(const uint8_t *p, uint8_t space)
     return *p;
 }
 
-static inline uint16_t sg_rom_word(const uint16_t *table_entry)
-{
-    return *table_entry;
-}
-#endif
-
-// Little-endian fields at any alignment.
 static inline uint16_t sg_rom_u16(const uint8_t *p, uint8_t space)
 {
-    return (uint16_t)(sg_rom_byte(p, space) | (uint16_t)((uint16_t)sg_rom_byte(p + 1, space) << 8));
+    (void)space;
+    return (uint16_t)(p[0] | (uint16_t)((uint16_t)p[1] << 8));
 }
 
 static inline uint32_t sg_rom_u32(const uint8_t *p, uint8_t space)
 {
     return sg_rom_u16(p, space) | ((uint32_t)sg_rom_u16(p + 2, space) << 16);
 }
+
+static inline uint16_t sg_rom_word(const uint16_t *entry)
+{
+    return *entry;
+}
+
+static inline uint32_t sg_rom_dword(const uint32_t *entry)
+{
+    return *entry;
+}
+#endif
 
 #endif
