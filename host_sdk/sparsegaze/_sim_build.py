@@ -14,8 +14,8 @@ from cffi import FFI
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 SIM_C = os.path.normpath(os.path.join(HERE, "..", "..", "sim_c"))
-HEADERS = ("sim_map.h",)
-SOURCES = ("sim_map.c",)
+HEADERS = ("sim_map.h", "sim_eye.h", "sim_scene.h")
+SOURCES = ("sim_map.c", "sim_eye.c", "sim_lid.c", "sim_face.c", "sim_glint.c", "sim_scene.c")
 
 
 def cdef_regions():
@@ -36,8 +36,8 @@ def builder():
         "\n".join('#include "%s"' % name for name in HEADERS),
         sources=[os.path.join(SIM_C, name) for name in SOURCES],
         include_dirs=[SIM_C],
-        libraries=["m"],
-        extra_compile_args=["-std=c11", "-O3", "-Wall", "-Wextra"],
+        libraries=["embree3", "m"],
+        extra_compile_args=["-std=c11", "-O3", "-fno-math-errno", "-Wall", "-Wextra"],
     )
     return ffi
 

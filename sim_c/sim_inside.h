@@ -1,0 +1,44 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What the parts of the simulator share about a scene; not for callers.
+#ifndef SIM_INSIDE_H
+#define SIM_INSIDE_H
+
+#include "sim_face.h"
+#include "sim_scene.h"
+
+#define SIM_RADIANS (3.14159265358979323846 / 180)
+
+// A place where at least one sensor or emitter is, head frame. Everything but the window depends on the place only.
+struct sim_site {
+    double position[3], radius;
+};
+
+struct sim_window {
+    int site;
+    double aim[3], per_tan2;  // 1 / (2 tan^2 sigma)
+};
+
+struct sim_scene {
+    struct sim_person person;
+    struct sim_quality quality;
+    struct sim_eye eye;
+    struct sim_face face;
+    int n_sites, n_sensors, n_emitters;
+    struct sim_site sites[2 * SIM_MAX_PORTS];
+    struct sim_window sensors[SIM_MAX_PORTS], emitters[SIM_MAX_PORTS];
+    double *nodes;  // Gauss-Legendre abscissas on -1..1 and weights: alpha, beta, iris ring, iris edge
+    const double *gauss[4];
+    double *face_all;    // [sensors][emitters] response of all skin with the lids closed
+    double *face_spots;  // [n_lid_spots][sensors + emitters] factors of each spot that an open eye may replace
+    int *lid_spots, n_lid_spots;
+};
+
+// A window's weight for light arriving along the unit vector `away` (from the scene to the site).
+double sim_window_weight(const struct sim_window *window, const double away[3]);
+
+// out += weight * sensor_part (x) emitter_part, each already including its window; sites' factors given per site.
+void sim_add_pairs(const struct sim_scene *scene, double weight, const double *sensor_part,
+                   const double *emitter_part, double *out);
+
+#endif

@@ -1,0 +1,80 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// One headset on one person: the response of every (sensor, emitter) pair to gaze, pupil and lids.
+//
+// Frame     head frame = OpenXR's axes (+x right, +y up, -z forward), origin at the eye's centre of rotation, right
+//           eye: +x is temporal. Straight ahead the eye looks along -z and its corneal apex lies near z = -13 mm; the
+//           headset is in front of it, at negative z. Ports are given in the headset's frame, whose origin is where a
+//           nominal person's centre of rotation is; person.eye_position_mm and slip move the two against each other.
+// Response  irradiance-like: integral over the scene of
+//               emitter beam / distance^2 * reflection * sensor window / distance^2,
+//           per unit axial intensity of the emitter, 1/mm^2. A window is exp(-tan^2(angle)/(2 tan^2 sigma)).
+//           One reflection only; skin, sclera and iris Lambertian; pupil black; the eye's front has a Beckmann glint
+//           whose width is the tear film's roughness and both lenses' radii (a disc of radius r at distance d widens
+//           the lobe of half vectors by r / (2 d)).
+// Left out  interreflection, lashes, the pupil's retro-reflection, the pupil's decentration, posterior cornea and lens.
+#ifndef SIM_SCENE_H
+#define SIM_SCENE_H
+
+#include <stddef.h>
+
+#include "sim_eye.h"
+
+// cdef begin
+enum { SIM_MAX_PORTS = 256, SIM_MAX_PUPILS = 32, SIM_MAX_LIDS = 32 };
+
+// A sensor or an emitter.
+struct sim_port {
+    double position_mm[3], aim[3];  // headset frame; aim need not be a unit vector
+    double sigma_deg;               // of the angular window or beam
+    double radius_mm;               // of the lens, as seen from the eye; 0 = a point
+};
+
+// How finely to integrate. NULL anywhere below means sim_quality_default().
+struct sim_quality {
+    int lid_alpha, lid_beta;   // Gauss-Legendre nodes over the opening, across and from margin to margin
+    int iris_ring, iris_edge;  // nodes in radius between two pupil edges; from the last one to the limbus
+    int iris_phi;              // nodes around
+    double glint_theta_deg;    // step of the profile
+    double glint_lobe;         // step around the axis, in lobe widths
+    double face_step_mm;
+};
+
+// Terms of the response that vary slowly with gaze.
+enum { SIM_TERM_FACE = 1, SIM_TERM_SCLERA = 2, SIM_TERM_IRIS = 4, SIM_TERM_SMOOTH = 7 };
+
+struct sim_scene;
+
+struct sim_quality sim_quality_default(void);
+
+// Check and prepare a scene: casts the face's visibility rays (about 0.1 s), nothing else does later.
+//   slip_mm   added to every port's position; NULL = none.
+//   error     receives one line when the scene is impossible: a port inside the eye or the face, a number that is not
+//             finite or out of any anatomy's range.
+// Returns the scene, or NULL.
+struct sim_scene *sim_scene_open(const struct sim_person *person, const struct sim_port *sensors,
+                                 int n_sensors, const struct sim_port *emitters, int n_emitters,
+                                 const double *slip_mm, const struct sim_quality *quality, char *error,
+                                 size_t error_bytes);
+void sim_scene_close(struct sim_scene *scene);
+
+// Sum of the chosen terms. One call shares its work over all pupils and lids.
+//   pupil_mm    ascending diameters, n_pupils <= SIM_MAX_PUPILS; lid_opening likewise
+//   out         [n_pupils][n_lids][sensors][emitters]
+// Returns 0, or -1 for bad arguments or lack of memory. Reentrant.
+int sim_scene_smooth(const struct sim_scene *scene, double azimuth_deg, double elevation_deg, int terms,
+                     const double *pupil_mm, int n_pupils, const double *lid_opening, int n_lids,
+                     double *out);
+
+// The glint. out [n_lids][sensors][emitters].
+int sim_scene_glint(const struct sim_scene *scene, double azimuth_deg, double elevation_deg,
+                    const double *lid_opening, int n_lids, double *out);
+
+// Height of the face over the frontal plane (mm forward of the centre of rotation), for pictures and checks.
+double sim_person_face_mm(const struct sim_person *person, double x_mm, double y_mm);
+
+// The eye's profile: distance from the centre of rotation at an angle from the optical axis.
+double sim_person_profile_mm(const struct sim_person *person, double angle_deg);
+// cdef end
+
+#endif
