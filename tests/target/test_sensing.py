@@ -154,17 +154,6 @@ def test_lights_are_out_right_after_the_sample(board, tmp_path):
     assert 0 < min(slot.dark - slot.sample for slot in slots) and latest <= 12 * CYCLES_PER_US
 
 
-def dark_after(rows, cycle):
-    """Cycles until the lights are out for good, after `cycle`; 0 if they already are."""
-    lit_until, lit = cycle, False
-    for at, _, _, _, leds in replay(rows):
-        if lit and at > cycle:
-            lit_until = at
-        lit = bool(leds)
-    assert not lit
-    return lit_until - cycle
-
-
 @pytest.mark.parametrize("flags", [[], ["-DHANG_LIT"]], ids=["main_loop", "everything_while_lit"])
 def test_a_hang_ends_in_the_dark_within_130_ms_and_is_reported_as_watchdog(virtual_nano, any_map, port_with, repo_root, tmp_path, flags):
     elf = port_with(repo_root / "tests" / "target" / "hang.c", *flags)

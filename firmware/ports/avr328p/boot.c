@@ -46,9 +46,9 @@ static uint8_t find_cause(void)
         return left_mcusr & known;
     if (version >= OPTIBOOT_KEEPS_CAUSE && version != 0xFFFF && (left_r2 & known))
         return left_r2 & known;
-    if (alive != ALIVE_SIGNATURE)
-        return SG_RESET_POWER;
-    return left_uart ? SG_RESET_EXTERNAL : SG_RESET_WATCHDOG;
+    if (left_uart)
+        return SG_RESET_EXTERNAL;
+    return alive != ALIVE_SIGNATURE ? SG_RESET_POWER : SG_RESET_WATCHDOG;
 }
 
 void hal_boot(void)

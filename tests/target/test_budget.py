@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cycles, stack, flash and RAM of the shipped binary against tests/budget.csv.
+
+A figure above its budget fails, and so does one more than SLACK below it: then the budget is lowered, in review, like code.
+"""
+
+import csv
+import subprocess
+
+import pytest
+
+from conftest import collect, random_features, random_model
+
+TARGET = "atmega328p"
+SLACK = 0.05
+FRAME_CYCLES = 57_600
+RAM_BYTES = 2048
+STACK_LEAST_FREE = 16
+# What an interrupt costs outside of its markers: entry 4, jump 3, saving and restoring 13 registers, flags, return.
+ISR_EDGES_CYCLES = 90
+SECTIONS = {"infer": "0", "feature": "1", "output": "2", "sense_isr": "3", "serial_isr": "4", "frame": "5"}
+
+
+@pytest.fixture(scope="module")
+def budget(repo_root):
+    """{name: {column: int or None}} of tests/budget.csv for this target."""
+    with open(repo_root / "tests" / "budget.csv", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["target"] == TARGET]
+    return {row["name"]: {key: int(row[key]) if row[key] else None for key in ("cycles_max", "stack", "flash", "ram")}
+            for row in rows}
+
+
+def judge(budget, name, column, measured):
+    """None, or what to change."""
+    allowed = budget[name][column]
+    if measured > allowed:
+        return f"{name}: {column} {measured} is above its budget of {allowed}"
+    if measured < allowed * (1 - SLACK):
+        return f"{name}: {column} {measured} is better than its budget of {allowed}: write {measured} into tests/budget.csv"
+    return None
+
+
+def judge_all(budget, found):
+    assert [text for text in (judge(budget, *item) for item in found) if text] == []
+
+
+def test_a_budget_fails_both_ways():
+    limits = {"x": {"cycles_max": 1000}}
+    assert judge(limits, "x", "cycles_max", 1000) is None and judge(limits, "x", "cycles_max", 950) is None
+    assert "above" in judge(limits, "x", "cycles_max", 1001)
+    assert "write 949" in judge(limits, "x", "cycles_max", 949)
+
+
+def test_cycles_of_every_section_while_64_vectors_stream_at_a_megabaud(board, budget):
+    nano, device = board(models={0: random_model(64).image})
+    device.set_stream(raw=True, gaze=True)
+    collect(device, 20)
+    nano.control.markers_clear()
+    collect(device, 400)
+    sections = nano.control.markers()
+    net = {name: sections[f"{key}n"] for name, key in SECTIONS.items()}
+    for name, section in net.items():
+        print(f"{name}: {section.least:.0f} / {section.mean:.0f} / {section.most:.0f} cycles of {section.count}")
+    frames = net["frame"].count
+    busy = net["frame"].mean + sum((net[name].mean + ISR_EDGES_CYCLES) * net[name].count / frames
+                                   for name in ("sense_isr", "serial_isr"))
+    print(f"busy {100 * busy / FRAME_CYCLES:.1f} % of a frame; frame with interrupts at most {sections['5'].most:.0f} cycles")
+    assert busy < 0.70 * FRAME_CYCLES and sections["5"].most < 0.70 * FRAME_CYCLES
+    assert device.status().late_frames == 0
+    judge_all(budget, [(name, "cycles_max", int(section.most)) for name, section in net.items()])
+
+
+def test_inference_takes_the_same_time_for_every_input_inside_the_range(board):
+    nano, device = board(models={0: random_model(64).image})
+    features = random_features(400)
+    features = features[(features > 31000).all(1) & (features < 40000).all(1)]
+    device.infer(features[:1])
+    nano.control.markers_clear()
+    device.set_stream(gaze=True)
+    collect(device, 100)
+    infer = nano.control.markers()["0n"]
+    assert infer.most - infer.least <= 0.03 * infer.most
+
+
+def test_stack_beside_the_static_data_after_everything_was_used(board, budget, avr_tools, firmware_elf):
+    static = static_ram(avr_tools, firmware_elf)
+    model = random_model(64)
+    nano, device = board(models={0: model.image, 1: random_model(216, generation=0).image})
+    device.set_stream(raw=True, gaze=True, counts=True)
+    device.infer(random_features(40))
+    device.trial(random_model(48, seed=3).image)
+    device.infer(random_features(10))
+    device.verify(1), device.verify(0), device.read_model(1), device.trial(None)
+    device.recentre((1, 1)), device.exposure(us=[100] * 6), device.exposure(auto=True), device.sync_clock()
+    device.model_info()
+    collect(device, 300)
+    free = device.status().stack_free
+    used = RAM_BYTES - static - free
+    print(f"static {static} B, stack used {used} B of {RAM_BYTES - static}, never touched {free} B")
+    assert RAM_BYTES - static >= 300 and free >= STACK_LEAST_FREE
+    judge_all(budget, [("firmware", "stack", used)])
+
+
+def test_flash_and_ram_of_the_shipped_binary(avr_tools, firmware_elf, budget):
+    sizes = section_sizes(avr_tools, firmware_elf)
+    flash = sizes[".text"] + sizes[".data"]
+    print(f"flash {flash} B of 24576, static RAM {static_ram(avr_tools, firmware_elf)} B of {RAM_BYTES}")
+    assert flash <= 0x6000
+    judge_all(budget, [("firmware", "flash", flash), ("firmware", "ram", static_ram(avr_tools, firmware_elf))])
+
+
+def test_nothing_of_the_binary_lies_in_the_model_slots(avr_tools, firmware_elf):
+    listing = subprocess.run([avr_tools / "avr-objdump", "-h", firmware_elf], check=True, capture_output=True, text=True).stdout
+    loaded = [line.split() for line in listing.splitlines() if line.split()[1:2] in ([".text"], [".data"])]
+    assert len(loaded) == 2
+    assert all(int(row[4], 16) + int(row[2], 16) <= 0x6000 for row in loaded)
+
+
+def section_sizes(avr_tools, elf):
+    listing = subprocess.run([avr_tools / "avr-size", "-A", "-d", elf], check=True, capture_output=True, text=True).stdout
+    rows = [line.split() for line in listing.splitlines()]
+    return {row[0]: int(row[1]) for row in rows if len(row) == 3 and row[1].isdigit()}
+
+
+def static_ram(avr_tools, elf):
+    sizes = section_sizes(avr_tools, elf)
+    return sum(sizes.get(name, 0) for name in (".data", ".bss", ".noinit"))
+
