@@ -7,7 +7,6 @@
             ...
 """
 
-from collections import deque
 from typing import NamedTuple, Optional
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from . import wire
 from .clock import Clock
 from .errors import DeviceError, NoDeviceError, ProtocolError
+from .exchange import Exchange, refusal
 from .stream import Assembler
 from .transport import open_link
 from .wire import Counts, Exposure, Gaze, Hello, Mode, ModelInfo, Pong, Raw, Recentre, Status, Verdict, lib
@@ -23,12 +23,8 @@ SPEEDS = (1_000_000, 500_000)
 BOOT_WAIT_S = 1.7               # the bootloader listens this long; what we said to it would only confuse it
 HELLO_EVERY_S = 0.25
 CONNECT_S = 6.0
-TRY_TIMEOUTS_S = (0.5, 1.0, 2.0)
-BUSY_WAIT_S = 0.02
-INFER_WINDOW = 4                # requests under way, 21 bytes each: the device's receive buffer has 128
-INFER_TRIES = 4
 PING_EVERY_S = 1.0
-QUEUE_FRAMES = 4096             # stream frames kept while a request waits for its answer
+QUEUE_FRAMES = 4096             # finished frames kept when nobody takes them
 
 
 class Frame(NamedTuple):
@@ -64,11 +60,9 @@ class Device:
         self.port = self.link.port
         self.clock = Clock()
         self.hello = None
-        self.stale = 0              # answers that nobody waited for
-        self._seq = 0
         self._stream_bits = 0
-        self._decoder = wire.Decoder()
-        self._arrived = deque()     # (packet, host time) of stream packets not yet looked at
+        self._token = 0
+        self._exchange = Exchange(self.link)
         self._assembler = Assembler(Frame, QUEUE_FRAMES, self.clock.unwrap)
         try:
             self.connect(timeout_s)
@@ -89,7 +83,7 @@ class Device:
             return
         try:
             if self._stream_bits and self.hello is not None:
-                self.link.write(b"\0" + wire.encode(lib.SG_MSG_MODE, self._next_seq(), wire.body("struct sg_mode", mode=0)))
+                self._exchange.send(lib.SG_MSG_MODE, wire.body("struct sg_mode", mode=0))
                 self.link.sleep(0.002)
         except Exception:           # the device is gone: there is nothing left to turn off
             pass
@@ -108,8 +102,8 @@ class Device:
             boot_wait_s = max(0.0, link.reset_s + BOOT_WAIT_S - start)
         self.hello = None
         self._stream_bits = 0
-        self._decoder = decoder = wire.Decoder()
-        self._arrived.clear()
+        self._exchange.restart()
+        decoder = self._exchange.decoder
         self._assembler.clear()
         self.clock.reset()
         link.set_baud(SPEEDS[0])
@@ -122,8 +116,7 @@ class Device:
             if speed != link.baud:
                 link.set_baud(speed)
                 decoder.clear()
-            seq = self._next_seq()
-            link.write(b"\0" + wire.encode(lib.SG_MSG_HELLO, seq))
+            self._exchange.send(lib.SG_MSG_HELLO)
             end = link.now() + HELLO_EVERY_S
             while link.now() < end:
                 for packet in decoder.feed(link.read(4096, end - link.now())):
@@ -133,45 +126,15 @@ class Device:
 
     # requests -----------------------------------------------------------------------------------------------------
 
-    def request(self, kind, body=b"", answer=None, sent=None):
-        """Send one request and return its answer, parsed as the record type `answer` (None: the body's bytes).
-
-        Requests are idempotent: a lost one is sent again, three tries in all.
-        sent    a list that gets the host time of each sending (for pings)
-        Raises DeviceError when the device refuses, NoDeviceError when it does not answer.
-        """
-        seq = self._next_seq()
-        data = wire.encode(kind, seq, body)
-        for attempt, timeout_s in enumerate(TRY_TIMEOUTS_S):
-            # The leading delimiter ends whatever half frame a disturbed line left in the device.
-            now = self.link.now()
-            self.link.write(b"\0" + data if attempt else data)
-            if sent is not None:
-                sent.append(now)
-            deadline = now + timeout_s
-            while self.link.now() < deadline:
-                found = self._wait(kind, seq, deadline)
-                if found is None:
-                    break
-                if found.type == lib.SG_MSG_ERROR:
-                    code, refused = wire.parse_error(found.body)
-                    if code != lib.SG_E_BUSY:
-                        raise _refusal(code, refused)
-                    self.link.sleep(BUSY_WAIT_S)
-                    self.link.write(data)
-                    continue
-                return found.body if answer is None else wire.parse(answer, found.body)
-        raise NoDeviceError(f"{self.port} no longer answers", "check the cable; if it stays silent, press the board's reset button")
-
     def status(self):
         """Status: device time, counters, exposures, reset cause."""
-        return self.request(lib.SG_MSG_STATUS, answer=Status)
+        return self._exchange.request(lib.SG_MSG_STATUS, answer=Status)
 
     def ping(self):
         """One round trip, taken into `clock`. Returns its Pong."""
-        token = self._next_seq() + 1
+        self._token = token = (self._token + 1) & 0xFFFFFFFF
         sent = []
-        pong = self.request(lib.SG_MSG_PING, wire.body("struct sg_ping", token=token), Pong, sent)
+        pong = self._exchange.request(lib.SG_MSG_PING, wire.body("struct sg_ping", token=token), Pong, sent)
         heard = self.link.now()
         if pong.token != token:
             raise ProtocolError("the device answered another ping than the one sent", "connect again")
@@ -189,9 +152,9 @@ class Device:
         """Choose what the device streams; all False turns the stream off."""
         bits = (lib.SG_STREAM_RAW * bool(raw) | lib.SG_STREAM_GAZE * bool(gaze) | lib.SG_STREAM_COUNTS * bool(counts))
         was, self._stream_bits = self._stream_bits, bits
-        self.request(lib.SG_MSG_MODE, wire.body("struct sg_mode", mode=bits), Mode)
+        self._exchange.request(lib.SG_MSG_MODE, wire.body("struct sg_mode", mode=bits), Mode)
         if not was:
-            self._arrived.clear()
+            self._exchange.forget_stream()
             self._assembler.clear()
         self._assembler.expect(bits)
 
@@ -202,40 +165,19 @@ class Device:
             raise ValueError(f"features are [n, {lib.SG_WIRE_CHANNELS}] unsigned 16-bit integers, not {rows.shape}")
         result = np.zeros((len(rows), 2))
         flags = np.zeros(len(rows), np.uint8)
-        waiting, todo = {}, deque((i, 0) for i in range(len(rows)))
-        while todo or waiting:
-            while todo and len(waiting) < INFER_WINDOW:
-                i, tries = todo.popleft()
-                if tries == INFER_TRIES:
-                    raise NoDeviceError(f"{self.port} no longer answers", "check the cable")
-                seq = self._next_seq()
-                waiting[seq] = i, tries, self.link.now() + TRY_TIMEOUTS_S[min(tries, len(TRY_TIMEOUTS_S) - 1)]
-                message = wire.encode(lib.SG_MSG_INFER, seq, wire.body("struct sg_infer", feature=rows[i].tolist()))
-                self.link.write(b"\0" + message if tries else message)
-            for packet in self._receive(min(limit for _, _, limit in waiting.values())):
-                if packet.seq not in waiting:
-                    self.stale += 1
-                    continue
-                i, tries, _ = waiting.pop(packet.seq)
-                if packet.type == lib.SG_MSG_INFER | lib.SG_REPLY:
-                    gaze = wire.parse(Gaze, packet.body)
-                    result[i] = gaze.azimuth_deg, gaze.elevation_deg
-                    flags[i] = gaze.flags
-                elif packet.type == lib.SG_MSG_ERROR:
-                    code, refused = wire.parse_error(packet.body)
-                    if code != lib.SG_E_BUSY:
-                        raise _refusal(code, refused)
-                    todo.appendleft((i, tries))
-                    self.link.sleep(BUSY_WAIT_S)
-            now = self.link.now()
-            for seq in [seq for seq, (_, _, limit) in waiting.items() if now >= limit]:
-                i, tries, _ = waiting.pop(seq)
-                todo.appendleft((i, tries + 1))
+
+        def take(i, answer):
+            gaze = wire.parse(Gaze, answer)
+            result[i] = gaze.azimuth_deg, gaze.elevation_deg
+            flags[i] = gaze.flags
+
+        bodies = [wire.body("struct sg_infer", feature=row) for row in rows.tolist()]
+        self._exchange.request_many(lib.SG_MSG_INFER, bodies, take)
         return Inference(result[:, 0], result[:, 1], flags)
 
     def model_info(self):
         """ModelInfo of both slots and the RAM trial."""
-        return self.request(lib.SG_MSG_MODEL_INFO, answer=ModelInfo)
+        return self._exchange.request(lib.SG_MSG_MODEL_INFO, answer=ModelInfo)
 
     def read_model(self, slot=None):
         """The image bytes stored in `slot` (0 A, 1 B, 2 RAM trial; None: the active one).
@@ -245,7 +187,7 @@ class Device:
         info = self.model_info()
         slot = info.active if slot is None else slot
         if slot > lib.SG_SLOT_RAM or info.verdict[slot] != lib.SG_OK:
-            raise _refusal(lib.SG_E_MAGIC, lib.SG_MSG_MODEL_READ)
+            raise refusal(lib.SG_E_MAGIC, lib.SG_MSG_MODEL_READ)
         size = lib.SG_MODEL_HEAD_BYTES + info.vectors[slot] * lib.SG_MODEL_RECORD_BYTES
         return self.read_slot(slot, size)
 
@@ -255,7 +197,7 @@ class Device:
         while len(image) < size:
             step = min(lib.SG_WIRE_DATA_MAX, size - len(image))
             body = wire.body("struct sg_model_at", offset=len(image), slot=slot, length=step)
-            _, offset, data = wire.parse_data(self.request(lib.SG_MSG_MODEL_READ, body))
+            _, offset, data = wire.parse_data(self._exchange.request(lib.SG_MSG_MODEL_READ, body))
             if offset != len(image) or len(data) != step:
                 raise ProtocolError("the device answered with another part of the model than asked for", "try again")
             image += data
@@ -263,7 +205,7 @@ class Device:
 
     def verify(self, slot):
         """Verdict on `slot` with the CRC-32 computed afresh by the device."""
-        return self.request(lib.SG_MSG_MODEL_VERIFY, wire.body("struct sg_model_at", slot=slot), Verdict)
+        return self._exchange.request(lib.SG_MSG_MODEL_VERIFY, wire.body("struct sg_model_at", slot=slot), Verdict)
 
     def trial(self, image):
         """Use a model from RAM until the next reset (image: bytes or DeviceModel); None goes back to the stored one.
@@ -271,17 +213,17 @@ class Device:
         Returns the Verdict. Raises DeviceError when the model does not fit (hello.trial_bytes) or is not valid.
         """
         if image is None:
-            return self.request(lib.SG_MSG_TRIAL_USE, wire.body("struct sg_mode", mode=0), Verdict)
+            return self._exchange.request(lib.SG_MSG_TRIAL_USE, wire.body("struct sg_mode", mode=0), Verdict)
         data = bytes(getattr(image, "image", image))
         if len(data) > self.hello.trial_bytes:
             raise DeviceError(lib.SG_E_BOUNDS, f"a trial model of {len(data)} bytes does not fit into the device's {self.hello.trial_bytes}",
                               "use fewer calibration vectors, or upload it")
         for offset in range(0, len(data), lib.SG_WIRE_DATA_MAX):
             part = data[offset:offset + lib.SG_WIRE_DATA_MAX]
-            self.request(lib.SG_MSG_TRIAL_WRITE, wire.data_body(lib.SG_SLOT_RAM, offset, part))
-        verdict = self.request(lib.SG_MSG_TRIAL_USE, wire.body("struct sg_mode", mode=1), Verdict)
+            self._exchange.request(lib.SG_MSG_TRIAL_WRITE, wire.data_body(lib.SG_SLOT_RAM, offset, part))
+        verdict = self._exchange.request(lib.SG_MSG_TRIAL_USE, wire.body("struct sg_mode", mode=1), Verdict)
         if verdict.verdict != lib.SG_OK:
-            raise _refusal(verdict.verdict, lib.SG_MSG_TRIAL_USE)
+            raise refusal(verdict.verdict, lib.SG_MSG_TRIAL_USE)
         return verdict
 
     def exposure(self, us=None, auto=None):
@@ -300,11 +242,11 @@ class Device:
             if max(map(abs, steps)) > 32767:
                 raise ValueError(f"a recentre offset of {offset_deg} deg is beyond +-255 deg")
             fields = {"op": lib.SG_RECENTRE_SET, "az_deg_q7": steps[0], "el_deg_q7": steps[1]}
-        return self.request(lib.SG_MSG_RECENTRE, wire.body("struct sg_recentre", **fields), Recentre)
+        return self._exchange.request(lib.SG_MSG_RECENTRE, wire.body("struct sg_recentre", **fields), Recentre)
 
     def reboot(self):
         """Restart the firmware by its watchdog and connect again."""
-        self.request(lib.SG_MSG_REBOOT, wire.body("struct sg_mode", mode=0xA5), Mode)
+        self._exchange.request(lib.SG_MSG_REBOOT, wire.body("struct sg_mode", mode=0xA5), Mode)
         # The watchdog start skips Optiboot's waiting, and nothing of the old run may pass for the new one.
         self.link.sleep(0.2)
         self.link.flush_input()
@@ -317,13 +259,13 @@ class Device:
         if baud == self.link.baud:
             return
         try:
-            self.request(lib.SG_MSG_BAUD, wire.body("struct sg_mode", mode=SPEEDS.index(baud)), Mode)
+            self._exchange.request(lib.SG_MSG_BAUD, wire.body("struct sg_mode", mode=SPEEDS.index(baud)), Mode)
         except NoDeviceError:       # if only the answer was lost, the device is at the new speed by now
             pass
         self.link.sleep(0.005)
         self.link.set_baud(baud)
-        self._decoder.clear()
-        self.request(lib.SG_MSG_HELLO, answer=Hello)
+        self._exchange.decoder.clear()
+        self._exchange.request(lib.SG_MSG_HELLO, answer=Hello)
 
     # the stream ---------------------------------------------------------------------------------------------------
 
@@ -336,8 +278,8 @@ class Device:
         heard = link.now()
         pinged, sent = heard, {}
         while True:
-            while self._arrived:
-                frames.take(*self._arrived.popleft())
+            for packet, host_time in self._exchange.stream():
+                frames.take(packet, host_time)
             for frame in frames.drain():
                 yield frame
                 heard = link.now()      # the time that the caller took is not the device's silence
@@ -346,19 +288,17 @@ class Device:
                 raise NoDeviceError(f"no frame has arrived from {self.port} for {timeout_s:g} s",
                                     "the device may have restarted: connect again")
             if now - pinged >= PING_EVERY_S:
-                seq = self._next_seq()
-                pinged, sent = now, {seq: now}
-                link.write(wire.encode(lib.SG_MSG_PING, seq, wire.body("struct sg_ping", token=seq)))
-            for packet in self._receive(now + min(0.1, timeout_s)):
+                pinged, sent = now, {self._exchange.send(lib.SG_MSG_PING, wire.body("struct sg_ping", token=0)): now}
+            for packet in self._exchange.receive(now + min(0.1, timeout_s)):
                 if packet.type == lib.SG_MSG_PING | lib.SG_REPLY and packet.seq in sent:
                     pong = wire.parse(Pong, packet.body)
                     self.clock.add(sent.pop(packet.seq), link.now(), pong.rx_us, pong.tx_us)
                 else:
-                    self.stale += 1
+                    self._exchange.stale += 1
 
     @property
     def lost(self):
-        """Frames missing between the received ones, by their sequence numbers."""
+        """Frames missing between the received ones, by their sequence numbers; also those nobody took in time."""
         return self._assembler.lost
 
     @property
@@ -374,42 +314,19 @@ class Device:
     @property
     def bad(self):
         """Received frames dropped for their coding, length or CRC."""
-        return self._decoder.bad
+        return self._exchange.decoder.bad
+
+    @property
+    def stale(self):
+        """Answers received that nothing waited for any more."""
+        return self._exchange.stale
 
     # ---------------------------------------------------------------------------------------------------------------
-
-    def _next_seq(self):
-        self._seq = (self._seq + 1) & 0xFFFF
-        return self._seq
-
-    def _receive(self, deadline):
-        """Answers received up to `deadline` (returns at the first bytes); stream packets go to the queue."""
-        data = self.link.read(4096, max(0.0, deadline - self.link.now()))
-        now = self.link.now()
-        answers = []
-        for packet in self._decoder.feed(data):
-            if lib.SG_MSG_RAW <= packet.type <= lib.SG_MSG_COUNTS:
-                self._arrived.append((packet, now))
-                if len(self._arrived) > 3 * QUEUE_FRAMES:
-                    self._assembler.take(*self._arrived.popleft())
-            else:
-                answers.append(packet)
-        return answers
-
-    def _wait(self, kind, seq, deadline):
-        found = None
-        while found is None and self.link.now() < deadline:
-            for packet in self._receive(deadline):
-                if packet.seq == seq and packet.type in (kind | lib.SG_REPLY, lib.SG_MSG_ERROR) and found is None:
-                    found = packet
-                else:
-                    self.stale += 1
-        return found
 
     def _exposure(self, op, steps=(0,) * 6):
         if len(steps) != lib.SG_WIRE_CHANNELS or min(steps) < 0 or max(steps) > 65535:
             raise ValueError(f"exposures are {lib.SG_WIRE_CHANNELS} values of 0..16383 us")
-        return self.request(lib.SG_MSG_EXPOSURE, wire.body("struct sg_exposure", op=op, exposure_us_q2=list(steps)), Exposure)
+        return self._exchange.request(lib.SG_MSG_EXPOSURE, wire.body("struct sg_exposure", op=op, exposure_us_q2=list(steps)), Exposure)
 
     def _greet(self, packet):
         prefix = wire.parse_hello_prefix(packet.body)
@@ -420,7 +337,7 @@ class Device:
                                 f"update this SDK, or run `sparsegaze flash {self.port}` to put its own firmware on the device")
         self.hello = wire.parse(Hello, packet.body)
         self.link.flush_input()
-        self._decoder.clear()
+        self._exchange.decoder.clear()
 
     def _nobody(self, decoder):
         if decoder.good:
@@ -432,10 +349,3 @@ class Device:
         return NoDeviceError(f"nothing answers on {self.port}",
                              f"check the cable and `sparsegaze list`; a new board needs `sparsegaze flash {self.port}` first")
 
-
-def _refusal(code, refused):
-    text = wire.ERROR_TEXT.get(code, f"error {code}")
-    return DeviceError(code, f"the device refused request 0x{refused:02X}: {text}", {
-        lib.SG_E_UNKNOWN: "flash the firmware that belongs to this SDK: `sparsegaze flash PORT`",
-        lib.SG_E_MAGIC: "calibrate, or upload a model first",
-    }.get(code, "`sparsegaze info PORT` shows the device's state"))

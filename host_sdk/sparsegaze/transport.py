@@ -28,6 +28,7 @@ READ_SLICES_S = (0.2, 0.02, 0.002)
 LOCKSTEP_SLICE_US = 1000        # while waiting for bytes
 LOCKSTEP_SLEEP_US = 20000       # 2000 bytes at 1 Mbaud: a pty holds 4095
 LOCKSTEP_WRITE_BYTES = 1024
+LOCKSTEP_PATIENCE_S = 10.0      # real seconds in which sent bytes must show up
 
 
 def open_link(port, baud=1_000_000):
@@ -243,12 +244,14 @@ class LockstepLink(SerialLink):
     def _advance(self, us):
         before = self._us
         self._us, device_bytes = self.control.advance(int(round(us)), self._sent)
+        patience = time.monotonic() + LOCKSTEP_PATIENCE_S
         while self._received < device_bytes:
             data = self._read_slice(device_bytes - self._received, READ_SLICES_S[0])
             self._received += len(data)
             self._ready += data
-            if not data and not os.path.exists(self.port):
-                raise self._gone(OSError(errno.EIO, "the virtual Nano stopped"))
+            if not data and time.monotonic() > patience:
+                raise DisconnectedError(f"{self.port} holds back bytes that the virtual Nano has sent",
+                                        "is another program reading from this port?")
         if us > before and self._us <= before:
             raise DisconnectedError(f"the clock of the virtual Nano behind {self.port} stands still (power is off)",
                                     "switch its power on again")

@@ -53,7 +53,7 @@ class VirtualNano:
     app         .hex or .elf that is in flash already
     state_dir   keeps flash and EEPROM between runs; default: a fresh one, removed at the end
     ambient     "dark", "room", "bright_room", "sun_gap";  light: "nominal", "dim", "bright"
-    map         path of a response map (.sgmap) to use instead of simulating headset and person
+    map         path of a response map (.sgmap) to use instead of simulating headset and person; False: no light at all
     link        symbolic link to make to the port;  truth: CSV to write the eye's true state to
     physics     {"section.key": value} over the constants of physics.toml
     progress    handed to the response map's computation
@@ -79,7 +79,7 @@ class VirtualNano:
         control = folder / "control"
         settings = {
             "bootloader": _absolute(boot_hex), "bootloader_start": f"0x{start:04X}", "state": _absolute(state),
-            "map": _absolute(map), "seed": int(person if seed is None else seed), "unpaced": int(bool(unpaced)),
+            "map": "none" if map is False else _absolute(map), "seed": int(person if seed is None else seed), "unpaced": int(bool(unpaced)),
             "auto_reset": int(bool(auto_reset)), "control": control, "ambient": ambient, "light": light,
         }
         for key, path in (("app", app), ("link", link), ("truth", truth)):

@@ -6,7 +6,7 @@ import pytest
 from fake_board import FakeBoard
 
 from sparsegaze import device as device_module
-from sparsegaze import wire
+from sparsegaze import exchange, wire
 from sparsegaze.device import Device
 from sparsegaze.errors import DeviceError, NoDeviceError, ProtocolError
 from sparsegaze.wire import lib
@@ -15,7 +15,7 @@ from sparsegaze.wire import lib
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch):
     monkeypatch.setattr(device_module, "BOOT_WAIT_S", 0.0)
-    monkeypatch.setattr(device_module, "TRY_TIMEOUTS_S", (0.3, 0.3, 0.3))
+    monkeypatch.setattr(exchange, "TRY_TIMEOUTS_S", (0.3, 0.3, 0.3))
 
 
 def packets():
