@@ -38,13 +38,15 @@ def run(device, screen, plan, path=None, meta=None, progress=None):
     with RecordingWriter(path, 6, meta) as writer:
         def on_target(index, part):
             chosen = _select(part, provisional=True)
-            writer.write(part.frames["t_us"], part.frames["features"], part.target_deg, chosen.valid)
+            rows = part.target_index >= 0
+            writer.write(part.frames["t_us"][rows], part.frames["features"][rows], part.target_deg[rows],
+                         chosen.valid[rows])
             writer.flush()
         try:
             whole = session.run(device, screen, plan, progress=progress, on_target=on_target, cut=cut)
         except BaseException:
-            if cut:
-                writer.comment(f"interrupted: {len(cut[0].onset_us)} of {len(plan)} targets shown or planned")
+            shown = int(cut[0].target_index.max()) + 1 if cut and len(cut[0].frames) else 0
+            writer.comment(f"interrupted: during target {shown} of {len(plan)}")
             raise
     return _finish(whole, os.fspath(path), meta)
 
