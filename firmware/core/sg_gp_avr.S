@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-; sg_gp_loop for AVR with a multiplier, bit-identical to sg_gp_loop.c. Formats in sg_gp_loop.h.
+; sg_gp_loop.c for AVR with a multiplier, bit-identical to it. Formats in sg_gp_loop.h.
 ;
-; Every value of the loop lives in a register but S2, half of s4, and s5, which are read from *sum once per record.
+; Every value of sg_gp_loop lives in a register but S2, half of s4, and s5, which are read from *sum once per record.
 
 #if defined(__AVR__) && !defined(SG_GP_PORTABLE)
 
@@ -227,5 +227,141 @@ done:
     pop r2
     ret
     .size sg_gp_loop, . - sg_gp_loop
+
+; void sg_gp_trend(struct sg_gp_sum *sum r25:r24, const uint8_t *trend r23:r22, uint8_t space r20)
+#define acc0 r18
+#define acc1 r19
+#define acc2 r20
+#define acc3 r21
+#define low r22
+#define high r23
+#define factor r24
+#define count r25
+#define SUM_S 12
+
+; acc = acc + trend * s over six channels; X walks s, Z walks trend
+.macro sum_trend load
+    movw r26, r28
+    adiw r26, SUM_S
+    ldi count, 6
+1:
+    ld low, X+
+    ld high, X+
+    \load factor, Z+
+    mul low, factor
+    add acc0, r0
+    adc acc1, r1
+    adc acc2, zero
+    adc acc3, zero
+    mul high, factor
+    add acc1, r0
+    adc acc2, r1
+    adc acc3, zero
+    \load factor, Z+
+    mul low, factor
+    add acc1, r0
+    adc acc2, r1
+    adc acc3, zero
+    mul high, factor
+    add acc2, r0
+    adc acc3, r1
+    \load factor, Z+
+    mul low, factor
+    add acc2, r0
+    adc acc3, r1
+    mul high, factor
+    add acc3, r0
+    \load factor, Z+
+    mul low, factor
+    add acc3, r0
+    dec count
+    brne 1b
+.endm
+
+.macro output at
+    ldd acc0, Y+\at
+    ldd acc1, Y+\at+1
+    ldd acc2, Y+\at+2
+    ldd acc3, Y+\at+3
+    brtc 2f
+    sum_trend lpm
+    rjmp 3f
+2:
+    sum_trend ld
+3:
+    std Y+\at, acc0
+    std Y+\at+1, acc1
+    std Y+\at+2, acc2
+    std Y+\at+3, acc3
+.endm
+
+    .section .text.sg_gp_trend, "ax", @progbits
+    .global sg_gp_trend
+    .type sg_gp_trend, @function
+sg_gp_trend:
+    push zero
+    push r28
+    push r29
+    clr zero
+    movw r28, r24
+    movw r30, r22
+    bst r20, 0                  ; T: SG_ROM_FLASH
+    output 0
+    output 4
+    pop r29
+    pop r28
+    pop zero
+    clr r1
+    ret
+    .size sg_gp_trend, . - sg_gp_trend
+
+; int32_t sg_gp_project(const struct sg_gp_sum *sum r25:r24, const uint8_t *row r23:r22, uint8_t space r20)
+#define sum0 r22                /* 24 bits hold it */
+#define sum1 r23
+#define sum2 r24
+#define part r21
+
+.macro project load
+1:
+    \load r20, Z+
+    ld part, X+
+    mulsu r20, part
+    sbc sum2, r18               ; carry is the product's sign
+    add sum0, r0
+    adc sum1, r1
+    adc sum2, r18
+    ld part, X+
+    mulsu r20, part
+    add sum1, r0
+    adc sum2, r1
+    dec count
+    brne 1b
+.endm
+
+    .section .text.sg_gp_project, "ax", @progbits
+    .global sg_gp_project
+    .type sg_gp_project, @function
+sg_gp_project:
+    movw r26, r24
+    adiw r26, SUM_S
+    movw r30, r22
+    clr r18
+    clr sum0
+    clr sum1
+    clr sum2
+    ldi count, 6
+    sbrs r20, 0
+    rjmp 2f
+    project lpm
+    rjmp 3f
+2:
+    project ld
+3:
+    clr r1
+    clr r25
+    sbrc sum2, 7
+    com r25
+    ret
+    .size sg_gp_project, . - sg_gp_project
 
 #endif

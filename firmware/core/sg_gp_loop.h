@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The inner loop of sg_gp. Two twins with identical bits: sg_gp_loop.c, portable, and sg_gp_avr.S. Both may
+// The inner loops of sg_gp. Two twins with identical bits: sg_gp_loop.c, portable, and sg_gp_avr.S. Both may
 // be given to the compiler: on AVR the C twin is empty, or with SG_GP_PORTABLE defined the assembly is.
 #ifndef SG_GP_LOOP_H
 #define SG_GP_LOOP_H
@@ -18,6 +18,12 @@ struct sg_gp_sum {
 
 // The assembly knows these places.
 _Static_assert(offsetof(struct sg_gp_sum, s2) == 8 && offsetof(struct sg_gp_sum, s_u8q4) == 12, "sum layout");
+
+// sum->acc += trend * s.   trend: int32[2][6] as stored, in `space`
+void sg_gp_trend(struct sg_gp_sum *sum, const uint8_t *trend, uint8_t space);
+
+// Returns row * s.   row: int8[6] as stored, in `space`. Below 2^22 in magnitude.
+int32_t sg_gp_project(const struct sg_gp_sum *sum, const uint8_t *row, uint8_t space);
 
 // sum->acc += weight_i * k_i over n records.
 //
