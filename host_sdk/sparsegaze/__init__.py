@@ -25,7 +25,8 @@ _LAZY = {
 }
 
 __all__ = sorted(_LAZY) + [
-    "CalibrationError", "DeviceError", "DisconnectedError", "FlashError", "ModelError", "NoDeviceError", "PortError",
+    "CalibrationError", "DeviceError", "DisconnectedError", "FlashError", "ModelError", "NoDeviceError",
+    "PortError",
     "ProtocolError", "RecordingError", "SceneError", "SparsegazeError", "VirtualError"]
 
 

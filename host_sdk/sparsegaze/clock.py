@@ -63,7 +63,7 @@ class Clock:
         self._unwrap = Unwrap(32)
 
     def add(self, sent_s, heard_s, rx_us, tx_us):
-        """Take one ping: host times of sending and hearing, device times of hearing and answering (32 bit)."""
+        """Take one ping: host times of sending and hearing, device times (32 bit) of the same."""
         rx = self._unwrap(rx_us)
         tx = rx + ((tx_us - rx_us) & 0xFFFFFFFF)
         trip = max(heard_s - sent_s - (tx - rx) * 1e-6, 0.0)

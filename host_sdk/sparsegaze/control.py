@@ -79,18 +79,21 @@ class VirtualControl:
                 self._buffer += part
         except socket.timeout:
             self.close()
-            raise VirtualError(f"the virtual Nano did not answer `{line}`", "stop it and start it again") from None
+            raise VirtualError(f"the virtual Nano did not answer `{line}`",
+                               "stop it and start it again") from None
         except OSError as error:
             self.close()
-            raise DisconnectedError(f"the virtual Nano behind {self.path} is gone ({error.strerror or 'connection closed'})",
+            reason = error.strerror or "connection closed"
+            raise DisconnectedError(f"the virtual Nano behind {self.path} is gone ({reason})",
                                     "start it again with `sparsegaze virtual`") from None
         reply, self._buffer = self._buffer.split(b"\n", 1)
         text = reply.decode("utf-8", "replace").strip()
         if text == "ok" or text.startswith("ok "):
             return text[2:].strip()
-        raise VirtualError(f"the virtual Nano refused `{line}`: {text[4:] if text.startswith('err ') else text}")
+        reason = text[4:] if text.startswith("err ") else text
+        raise VirtualError(f"the virtual Nano refused `{line}`: {reason}")
 
-    # time ---------------------------------------------------------------------------------------------------------
+    # time ---------------------------------------------------------------------------------------------------
 
     def time(self):
         cycle, us, running = self.command("time").split()[:3]
@@ -103,12 +106,12 @@ class VirtualControl:
     def advance(self, us, host_bytes):
         """Run until `us`, having first taken host bytes up to `host_bytes` in all since lockstep began.
 
-        Returns (us, device_bytes): the time reached and the bytes the device has sent in all since lockstep began.
+        Returns (us, device_bytes): the time reached, and the bytes sent by the device since lockstep began.
         """
         now, device_bytes = self.command(f"advance {us} {host_bytes}").split()[:2]
         return float(now), int(device_bytes)
 
-    # the person ---------------------------------------------------------------------------------------------------
+    # the person ---------------------------------------------------------------------------------------------
 
     def target(self, us, azimuth_deg, elevation_deg):
         """From `us` on the person looks at this direction (after the human latency)."""
@@ -132,7 +135,7 @@ class VirtualControl:
         """Write the true state to `path` every millisecond; None stops."""
         self.command(f"truth {_path(path)}")
 
-    # the board ----------------------------------------------------------------------------------------------------
+    # the board ----------------------------------------------------------------------------------------------
 
     def reset(self):
         self.command("reset")
@@ -160,7 +163,8 @@ class VirtualControl:
         self.command("markers clear")
 
     def counters(self):
-        return {key: int(float(value)) for key, value in (item.split("=", 1) for item in self.command("counters").split())}
+        items = (item.split("=", 1) for item in self.command("counters").split())
+        return {key: int(float(value)) for key, value in items}
 
     def frames(self, path=None):
         """Log the cycles of first release, last sample and sent delimiters to `path`; None stops."""

@@ -51,7 +51,7 @@ class Device:
 
     port     port name, or an open Link (then not closed by this object)
     timeout_s  how long to wait for the firmware, s of the link's clock
-    Raises PortError, NoDeviceError (nothing or something foreign behind the port), ProtocolError (other version).
+    Raises PortError, NoDeviceError (nothing or something foreign answers), ProtocolError (other version).
     """
 
     def __init__(self, port, timeout_s=CONNECT_S):
@@ -124,7 +124,7 @@ class Device:
                         return self._greet(packet)
         raise self._nobody(decoder)
 
-    # requests -----------------------------------------------------------------------------------------------------
+    # requests -----------------------------------------------------------------------------------------------
 
     def status(self):
         """Status: device time, counters, exposures, reset cause."""
@@ -150,7 +150,8 @@ class Device:
 
     def set_stream(self, raw=False, gaze=False, counts=False):
         """Choose what the device streams; all False turns the stream off."""
-        bits = (lib.SG_STREAM_RAW * bool(raw) | lib.SG_STREAM_GAZE * bool(gaze) | lib.SG_STREAM_COUNTS * bool(counts))
+        bits = (lib.SG_STREAM_RAW * bool(raw) | lib.SG_STREAM_GAZE * bool(gaze)
+                | lib.SG_STREAM_COUNTS * bool(counts))
         was, self._stream_bits = self._stream_bits, bits
         self._exchange.request(lib.SG_MSG_MODE, wire.body("struct sg_mode", mode=bits), Mode)
         if not was:
@@ -159,10 +160,12 @@ class Device:
         self._assembler.expect(bits)
 
     def infer(self, features):
-        """Gazes that the device computes from `features` ([n, 6] or [6], unsigned 16 bit). Returns Inference."""
+        """Inference that the device makes of `features`, [n, 6] or [6], unsigned 16 bit."""
         rows = np.atleast_2d(np.asarray(features))
-        if rows.ndim != 2 or rows.shape[1] != lib.SG_WIRE_CHANNELS or rows.size and (rows.min() < 0 or rows.max() > 65535):
-            raise ValueError(f"features are [n, {lib.SG_WIRE_CHANNELS}] unsigned 16-bit integers, not {rows.shape}")
+        if rows.shape[1:] != (lib.SG_WIRE_CHANNELS,):
+            raise ValueError(f"features are [n, {lib.SG_WIRE_CHANNELS}], not {rows.shape}")
+        if rows.size and (rows.min() < 0 or rows.max() > 65535):
+            raise ValueError("features are unsigned 16-bit integers")
         result = np.zeros((len(rows), 2))
         flags = np.zeros(len(rows), np.uint8)
 
@@ -199,24 +202,29 @@ class Device:
             body = wire.body("struct sg_model_at", offset=len(image), slot=slot, length=step)
             _, offset, data = wire.parse_data(self._exchange.request(lib.SG_MSG_MODEL_READ, body))
             if offset != len(image) or len(data) != step:
-                raise ProtocolError("the device answered with another part of the model than asked for", "try again")
+                raise ProtocolError("the device answered with another part of the model than asked for",
+                                    "try again")
             image += data
         return bytes(image)
 
     def verify(self, slot):
         """Verdict on `slot` with the CRC-32 computed afresh by the device."""
-        return self._exchange.request(lib.SG_MSG_MODEL_VERIFY, wire.body("struct sg_model_at", slot=slot), Verdict)
+        return self._exchange.request(lib.SG_MSG_MODEL_VERIFY, wire.body("struct sg_model_at", slot=slot),
+                                      Verdict)
 
     def trial(self, image):
-        """Use a model from RAM until the next reset (image: bytes or DeviceModel); None goes back to the stored one.
+        """Use a model from RAM until the next reset; None goes back to the stored one.
 
-        Returns the Verdict. Raises DeviceError when the model does not fit (hello.trial_bytes) or is not valid.
+        image   bytes or DeviceModel, at most hello.trial_bytes
+        Returns the Verdict. Raises DeviceError when the model does not fit or is not valid.
         """
         if image is None:
             return self._exchange.request(lib.SG_MSG_TRIAL_USE, wire.body("struct sg_mode", mode=0), Verdict)
         data = bytes(getattr(image, "image", image))
         if len(data) > self.hello.trial_bytes:
-            raise DeviceError(lib.SG_E_BOUNDS, f"a trial model of {len(data)} bytes does not fit into the device's {self.hello.trial_bytes}",
+            raise DeviceError(lib.SG_E_BOUNDS,
+                              f"a trial model of {len(data)} bytes does not fit into the device's "
+                              f"{self.hello.trial_bytes}",
                               "use fewer calibration vectors, or upload it")
         for offset in range(0, len(data), lib.SG_WIRE_DATA_MAX):
             part = data[offset:offset + lib.SG_WIRE_DATA_MAX]
@@ -227,7 +235,10 @@ class Device:
         return verdict
 
     def exposure(self, us=None, auto=None):
-        """Exposures in force. us: six exposures in us to set and hold; auto: True adapt, False hold what there is."""
+        """Exposures in force.
+
+        us     six exposures, us, to set and hold;  auto   True: adapt them, False: hold what there is
+        """
         if us is not None:
             return self._exposure(lib.SG_EXPOSURE_SET, [int(round(4 * value)) for value in us])
         if auto is not None:
@@ -235,14 +246,18 @@ class Device:
         return self._exposure(lib.SG_EXPOSURE_GET)
 
     def recentre(self, offset_deg=None, clear=False):
-        """Recentre offset in force. offset_deg: (azimuth, elevation) to add to the model's output; clear: none."""
+        """Recentre offset in force.
+
+        offset_deg   (azimuth, elevation) to add to the model's output from now on;  clear   True: none
+        """
         fields = {"op": lib.SG_RECENTRE_CLEAR if clear else lib.SG_RECENTRE_GET}
         if offset_deg is not None:
             steps = [int(round(128 * value)) for value in offset_deg]
             if max(map(abs, steps)) > 32767:
                 raise ValueError(f"a recentre offset of {offset_deg} deg is beyond +-255 deg")
             fields = {"op": lib.SG_RECENTRE_SET, "az_deg_q7": steps[0], "el_deg_q7": steps[1]}
-        return self._exchange.request(lib.SG_MSG_RECENTRE, wire.body("struct sg_recentre", **fields), Recentre)
+        return self._exchange.request(lib.SG_MSG_RECENTRE, wire.body("struct sg_recentre", **fields),
+                                      Recentre)
 
     def reboot(self):
         """Restart the firmware by its watchdog and connect again."""
@@ -259,7 +274,8 @@ class Device:
         if baud == self.link.baud:
             return
         try:
-            self._exchange.request(lib.SG_MSG_BAUD, wire.body("struct sg_mode", mode=SPEEDS.index(baud)), Mode)
+            self._exchange.request(lib.SG_MSG_BAUD, wire.body("struct sg_mode", mode=SPEEDS.index(baud)),
+                                   Mode)
         except NoDeviceError:       # if only the answer was lost, the device is at the new speed by now
             pass
         self.link.sleep(0.005)
@@ -267,7 +283,7 @@ class Device:
         self._exchange.decoder.clear()
         self._exchange.request(lib.SG_MSG_HELLO, answer=Hello)
 
-    # the stream ---------------------------------------------------------------------------------------------------
+    # the stream ---------------------------------------------------------------------------------------------
 
     def frames(self, timeout_s=2.0):
         """Iterator over Frames as they arrive, for ever. Pings about once a second to keep `clock` fitted.
@@ -288,7 +304,8 @@ class Device:
                 raise NoDeviceError(f"no frame has arrived from {self.port} for {timeout_s:g} s",
                                     "the device may have restarted: connect again")
             if now - pinged >= PING_EVERY_S:
-                pinged, sent = now, {self._exchange.send(lib.SG_MSG_PING, wire.body("struct sg_ping", token=0)): now}
+                seq = self._exchange.send(lib.SG_MSG_PING, wire.body("struct sg_ping", token=0))
+                pinged, sent = now, {seq: now}
             for packet in self._exchange.receive(now + min(0.1, timeout_s)):
                 if packet.type == lib.SG_MSG_PING | lib.SG_REPLY and packet.seq in sent:
                     pong = wire.parse(Pong, packet.body)
@@ -298,7 +315,7 @@ class Device:
 
     @property
     def lost(self):
-        """Frames missing between the received ones, by their sequence numbers; also those nobody took in time."""
+        """Frames missing between the received ones, by their numbers; also those nobody took in time."""
         return self._assembler.lost
 
     @property
@@ -321,20 +338,22 @@ class Device:
         """Answers received that nothing waited for any more."""
         return self._exchange.stale
 
-    # ---------------------------------------------------------------------------------------------------------------
+    # --------------------------------------------------------------------------------------------------------
 
     def _exposure(self, op, steps=(0,) * 6):
         if len(steps) != lib.SG_WIRE_CHANNELS or min(steps) < 0 or max(steps) > 65535:
             raise ValueError(f"exposures are {lib.SG_WIRE_CHANNELS} values of 0..16383 us")
-        return self._exchange.request(lib.SG_MSG_EXPOSURE, wire.body("struct sg_exposure", op=op, exposure_us_q2=list(steps)), Exposure)
+        body = wire.body("struct sg_exposure", op=op, exposure_us_q2=list(steps))
+        return self._exchange.request(lib.SG_MSG_EXPOSURE, body, Exposure)
 
     def _greet(self, packet):
-        prefix = wire.parse_hello_prefix(packet.body)
-        if prefix.wire_version != lib.SG_WIRE_VERSION:
-            raise ProtocolError(f"device speaks protocol {prefix.wire_version} (firmware {prefix.firmware_text}), "
-                                f"this SDK speaks {lib.SG_WIRE_VERSION}",
-                                f"run `sparsegaze flash {self.port}`" if prefix.wire_version < lib.SG_WIRE_VERSION else
-                                f"update this SDK, or run `sparsegaze flash {self.port}` to put its own firmware on the device")
+        theirs = wire.parse_hello_prefix(packet.body)
+        if theirs.wire_version != lib.SG_WIRE_VERSION:
+            remedy = f"run `sparsegaze flash {self.port}`"
+            if theirs.wire_version > lib.SG_WIRE_VERSION:
+                remedy = f"update this SDK, or {remedy} to put its own firmware on the device"
+            raise ProtocolError(f"device speaks protocol {theirs.wire_version} (firmware "
+                                f"{theirs.firmware_text}), this SDK speaks {lib.SG_WIRE_VERSION}", remedy)
         self.hello = wire.parse(Hello, packet.body)
         self.link.flush_input()
         self._exchange.decoder.clear()
@@ -343,9 +362,10 @@ class Device:
         if decoder.good:
             return NoDeviceError(f"frames arrive from {self.port}, but it answers no request",
                                  "check the wire from the host's transmitter to the board's receiver (D0)")
+        flash = f"`sparsegaze flash {self.port}`"
         if decoder.heard:
-            return NoDeviceError(f"{self.port} sends something, but not in sparsegaze's protocol (first bytes: {decoder.heard[:16]!r})",
-                                 f"this is another device or another firmware; if it is your board, run `sparsegaze flash {self.port}`")
+            return NoDeviceError(f"{self.port} sends something, but not in sparsegaze's protocol "
+                                 f"(first bytes: {decoder.heard[:16]!r})",
+                                 f"this is another device or firmware; if it is your board, run {flash}")
         return NoDeviceError(f"nothing answers on {self.port}",
-                             f"check the cable and `sparsegaze list`; a new board needs `sparsegaze flash {self.port}` first")
-
+                             f"check the cable and `sparsegaze list`; a new board needs {flash} first")

@@ -9,7 +9,7 @@ from .wire import lib
 
 TRY_TIMEOUTS_S = (0.5, 1.0, 2.0)
 BUSY_WAIT_S = 0.02
-WINDOW = 4                      # requests under way in request_many: the device's receive buffer has 128 bytes
+WINDOW = 4                      # requests under way at a time: the device's receive buffer has 128 bytes
 STREAM_KEPT = 3 * 4096          # stream packets kept while nobody takes them
 
 
@@ -38,13 +38,15 @@ class Exchange:
         return self._seq
 
     def send(self, kind, body=b"", seq=None):
-        """Send one request; returns its number. The leading delimiter ends whatever half frame a disturbed line left."""
+        """Send one request; returns its number. The leading delimiter ends whatever half frame a disturbed
+        line left."""
         seq = self.next_seq() if seq is None else seq
         self.link.write(b"\0" + wire.encode(kind, seq, body))
         return seq
 
     def receive(self, deadline):
-        """Answers that have arrived by `deadline` (returns at the first bytes); stream packets go to stream()."""
+        """Answers that have arrived by `deadline` (returns at the first bytes); stream packets go to
+        stream()."""
         data = self.link.read(4096, max(0.0, deadline - self.link.now()))
         now = self.link.now()
         answers = []
@@ -67,7 +69,8 @@ class Exchange:
         self._stream.clear()
 
     def request(self, kind, body=b"", answer=None, sent=None):
-        """Send one request and return its answer, parsed as the record type `answer` (None: the body's bytes).
+        """Send one request and return its answer, parsed as the record type `answer` (None: the body's
+        bytes).
 
         Requests are idempotent: a lost one is sent again with its number, three tries in all.
         sent    a list that gets the host time of each sending (for pings)
@@ -83,7 +86,8 @@ class Exchange:
             while self.link.now() < deadline:
                 found = None
                 for packet in self.receive(deadline):
-                    if packet.seq != seq or packet.type not in (kind | lib.SG_REPLY, lib.SG_MSG_ERROR) or found:
+                    if packet.seq != seq or packet.type not in (kind | lib.SG_REPLY,
+                                                                lib.SG_MSG_ERROR) or found:
                         self.stale += 1
                     else:
                         found = packet
@@ -97,7 +101,8 @@ class Exchange:
         raise self._silent()
 
     def request_many(self, kind, bodies, take):
-        """Send many requests of one kind, several under way at a time; take(i, answer's body) for each, in any order."""
+        """Send many requests of one kind, several under way at a time; take(i, answer's body) for each, in
+        any order."""
         waiting, todo = {}, deque((i, 0) for i in range(len(bodies)))
         while todo or waiting:
             while todo and len(waiting) < WINDOW:

@@ -38,7 +38,8 @@ def load_hex(path=None):
         remedy = "build it with `make firmware`" if path == FIRMWARE_HEX else "check the file's name"
         raise FlashError(f"cannot read {path} ({error.strerror})", remedy) from None
     except UnicodeDecodeError:
-        raise FlashError(f"{path} is not an Intel HEX file", "give the .hex file, not the .elf or .bin") from None
+        raise FlashError(f"{path} is not an Intel HEX file",
+                         "give the .hex file, not the .elf or .bin") from None
     image = IntelHex()
     try:
         _check_lines(path, text)
@@ -48,7 +49,8 @@ def load_hex(path=None):
     if not image.addresses():
         raise FlashError(f"{path} holds no program", "build or download it again")
     if image.maxaddr() >= APPLICATION_BYTES:
-        raise FlashError(f"{path} reaches to 0x{image.maxaddr():04X}, the application area ends at 0x{APPLICATION_BYTES - 1:04X}",
+        raise FlashError(f"{path} reaches to 0x{image.maxaddr():04X}, "
+                         f"the application area ends at 0x{APPLICATION_BYTES - 1:04X}",
                          "this hex is too large or made for another chip")
     if image.minaddr() != 0:
         raise FlashError(f"{path} begins at 0x{image.minaddr():04X}, not at the reset vector",
@@ -63,9 +65,10 @@ def flash_hex(link, path=None, progress=None):
     """Flash an Intel HEX file (default: the firmware that came with this package) and start it.
 
     link      an open Link, or a port's name
-    progress  called as progress(stage, done, total), stage "write", "verify" (pages) or "press reset" (seconds)
-    Returns a FlashReport. Raises FlashError, PortError, DisconnectedError. Only pages of the hex are written, so
-    stored models and the EEPROM stay as they are.
+    progress  called as progress(stage, done, total): "write" and "verify" in pages, "press reset" in seconds
+
+    Returns a FlashReport. Raises FlashError, PortError, DisconnectedError. Only pages of the hex are written,
+    so stored models and the EEPROM stay as they are.
     """
     pages, n_bytes = load_hex(path)     # before anything is touched
     if isinstance(link, (str, os.PathLike)):
@@ -91,7 +94,8 @@ def _flash(link, pages, n_bytes, progress):
         bootloader.leave()
     except (DisconnectedError, FlashError) as error:
         raise type(error)(f"flashing was not finished: {error.message}",
-                          f"{error.remedy}; stored models are untouched, and `sparsegaze flash {link.port}` starts afresh") from None
+                          f"{error.remedy}; stored models are untouched, "
+                          f"and `sparsegaze flash {link.port}` starts afresh") from None
     return FlashReport(n_bytes, len(pages), True, link.now() - start, bootloader.name, bootloader.baud)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which ports there are: running virtual Nanos (one JSON file each in a private directory) and serial ports."""
+"""Which ports there are: running virtual Nanos, one JSON file each in a private place, and serial ports."""
 
 import json
 import os
@@ -35,7 +35,7 @@ class PortInfo(NamedTuple):
 
 
 def directory():
-    """The private directory of the registry files; created with mode 0700. Raises VirtualError when it is not ours."""
+    """The private directory of the files, made when missing. Raises VirtualError if it is not ours."""
     uid = os.getuid() if hasattr(os, "getuid") else 0
     base = os.environ.get("XDG_RUNTIME_DIR") or ("/tmp" if os.path.isdir("/tmp") else tempfile.gettempdir())
     path = Path(base) / f"sparsegaze-{uid}"
@@ -43,10 +43,13 @@ def directory():
         path.mkdir(mode=0o700, exist_ok=True)
         info = os.lstat(path)
     except OSError as error:
-        raise VirtualError(f"cannot use {path} ({error.strerror})", "set XDG_RUNTIME_DIR to a directory of yours") from None
-    # What stands in these files decides which sockets we talk to: a directory planted by another user is refused.
-    if hasattr(os, "getuid") and (not stat.S_ISDIR(info.st_mode) or info.st_uid != uid or info.st_mode & 0o022):
-        raise VirtualError(f"{path} is not a private directory of this user", "remove it or set XDG_RUNTIME_DIR")
+        raise VirtualError(f"cannot use {path} ({error.strerror})",
+                           "set XDG_RUNTIME_DIR to a directory of yours") from None
+    # What stands in these files decides which sockets we talk to: a directory planted by another is refused.
+    private = stat.S_ISDIR(info.st_mode) and info.st_uid == uid and not info.st_mode & 0o022
+    if hasattr(os, "getuid") and not private:
+        raise VirtualError(f"{path} is not a private directory of this user",
+                           "remove it or set XDG_RUNTIME_DIR")
     return path
 
 
@@ -95,13 +98,15 @@ def find(port):
 
 
 def ports():
-    """Every port one could try, as a list of PortInfo: virtual Nanos first, then USB, then the other serial ports."""
+    """Every port one could try, as a list of PortInfo: virtual Nanos, then USB, then other serial ports."""
     from serial.tools import list_ports
 
-    rows = [PortInfo(entry.link or entry.port, "virtual",
-                     f"virtual Nano, {Path(entry.headset).stem}, person {entry.person}, "
-                     f"{'unpaced' if entry.unpaced else 'real time'}{'' if entry.auto_reset else ', no auto-reset'}",
-                     entry) for entry in entries()]
+    rows = []
+    for entry in entries():
+        text = f"virtual Nano, {Path(entry.headset).stem}, person {entry.person}"
+        text += ", unpaced" if entry.unpaced else ", real time"
+        text += "" if entry.auto_reset else ", no auto-reset"
+        rows.append(PortInfo(entry.link or entry.port, "virtual", text, entry))
     real = []
     for info in list_ports.comports():
         usb = info.vid is not None

@@ -30,13 +30,13 @@ class Bootloader:
     def enter(self, progress=None):
         """Reset the board into its bootloader, find its speed, check the chip.
 
-        progress   called as progress("press reset", done_s, total_s) while a board that does not reset by itself
-                   waits for its reset button
+        progress   called as progress("press reset", done_s, total_s) while a board without auto-reset waits
+                   for its button
         Raises FlashError when no bootloader answers or the chip is another one.
         """
         for _ in range(RESETS_PER_SPEED):
             for baud, name in BOOTLOADERS:
-                # At the wrong speed a bootloader hears garbage and may start the application: each try has its own reset.
+                # At the wrong speed a bootloader hears garbage and may start the application: reset per try.
                 self.link.set_baud(baud)
                 if self.link.reset() and self._sync(SYNC_WAIT_S, 2):
                     return self._found(baud, name)
@@ -59,7 +59,7 @@ class Bootloader:
         self._command(bytes((_LEAVE,)))
 
     def _wait_for_button(self, progress):
-        # One speed for half of the time, then the other: garbage at the wrong speed would end the right one's wait.
+        # One speed for half of the time, then the other: garbage at the wrong one would end the other's wait.
         start = self.link.now()
         for half, (baud, name) in enumerate(BOOTLOADERS, 1):
             self.link.set_baud(baud)
@@ -69,12 +69,12 @@ class Bootloader:
                 if self._sync(SYNC_WAIT_S, 1):
                     return self._found(baud, name)
         raise FlashError(f"no bootloader answers on {self.link.port} at 115200 or 57600 baud",
-                         "press the board's reset button when asked to; a chip without the stock Arduino bootloader "
-                         "needs an ISP programmer")
+                         "press the board's reset button when asked to; a chip without the stock Arduino "
+                         "bootloader needs an ISP programmer")
 
     def _sync(self, wait_s, tries):
-        # One sync, then patience: the receiver holds two bytes while the bootloader blinks, and a third would split
-        # a command in two.
+        # One sync, then patience: the receiver holds two bytes while the bootloader blinks, and a third would
+        # split a command in two.
         for _ in range(tries):
             self.link.flush_input()
             self.link.write(bytes((_GET_SYNC, _EOP)))
@@ -89,8 +89,9 @@ class Bootloader:
         self.baud, self.name = baud, name
         signature = self._command(bytes((_SIGNATURE,)), 3)
         if signature != SIGNATURE:
-            raise FlashError(f"the chip on {self.link.port} has signature {signature.hex(' ')}, this firmware is for an "
-                             f"ATmega328P ({SIGNATURE.hex(' ')})", "connect an Arduino Nano with an ATmega328P")
+            raise FlashError(f"the chip on {self.link.port} has signature {signature.hex(' ')}, "
+                             f"this firmware is for an ATmega328P ({SIGNATURE.hex(' ')})",
+                             "connect an Arduino Nano with an ATmega328P")
         self._command(bytes((_ENTER,)))
 
     def _load_address(self, address):
@@ -101,7 +102,8 @@ class Bootloader:
         self.link.write(message + bytes((_EOP,)))
         answer = self._collect(n + 2, ANSWER_WAIT_S)
         if len(answer) != n + 2 or answer[0] != _INSYNC or answer[-1] != _OK:
-            raise FlashError(f"the bootloader on {self.link.port} stopped answering (heard {answer[:4].hex(' ') or 'nothing'})",
+            heard = answer[:4].hex(" ") or "nothing"
+            raise FlashError(f"the bootloader on {self.link.port} stopped answering (heard {heard})",
                              "check the cable and the supply, then flash again")
         return answer[1:-1]
 
@@ -127,7 +129,8 @@ def verify_pages(bootloader, pages, step=None):
         found = bootloader.read_page(address)
         if found != data:
             at = next(i for i in range(PAGE_BYTES) if found[i] != data[i])
-            raise FlashError(f"flash reads back 0x{found[at]:02X} instead of 0x{data[at]:02X} at 0x{address + at:04X}",
+            raise FlashError(f"flash reads back 0x{found[at]:02X} instead of 0x{data[at]:02X} "
+                             f"at 0x{address + at:04X}",
                              "try again; if it repeats, the chip's flash is worn out")
         if step is not None:
             step()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Putting a model into the device: the inactive of two flash slots, its header page last.
 
-A cut at any moment leaves the old model or the new one: until its last page is whole the slot is not a model, and
-the other slot is never touched.
+A cut at any moment leaves the old model or the new one: until its last page is whole the slot is not a model,
+and the other slot is never touched.
 """
 
 import os
@@ -33,8 +33,8 @@ def upload(port, model, progress=None):
     port      a port's name or an open Link
     model     image bytes, or an object with .image (DeviceModel)
     progress  called as progress(stage, done, total), stage "write", "verify" or "press reset"
-    Returns an UploadReport once the restarted device says that this model, by its CRC, is the one in use. Raises
-    ModelError (before the device is touched), FlashError, PortError, NoDeviceError, DisconnectedError.
+    Returns an UploadReport once the restarted device says that this model, by its CRC, is the one in use.
+    Raises ModelError (before the device is touched), FlashError, PortError, NoDeviceError, DisconnectedError.
     """
     image = bytes(getattr(model, "image", model))
     head = check_image(image)
@@ -45,20 +45,24 @@ def upload(port, model, progress=None):
 
 
 def check_image(image):
-    """The header (cdata struct sg_model_head) of a whole, undamaged model image. Raises ModelError otherwise."""
+    """The header (struct sg_model_head) of a whole, undamaged model image; all else raises ModelError."""
     head = ffi.new("struct sg_model_head *")
     ffi.memmove(head, image, min(len(image), lib.SG_MODEL_PAGE))
     if len(image) < lib.SG_MODEL_HEAD_BYTES:
-        raise ModelError(f"the model is truncated: {len(image)} bytes, a header alone has {lib.SG_MODEL_HEAD_BYTES}", _AGAIN)
+        raise ModelError(f"the model is truncated: {len(image)} bytes, "
+                         f"a header alone has {lib.SG_MODEL_HEAD_BYTES}", _AGAIN)
     if head.magic != lib.SG_MODEL_MAGIC:
-        raise ModelError("this is not a sparsegaze model (wrong magic number)", "give a .sgm file made by `sparsegaze fit`")
+        raise ModelError("this is not a sparsegaze model (wrong magic number)",
+                         "give a .sgm file made by `sparsegaze fit`")
     if head.version != lib.SG_MODEL_VERSION:
-        raise ModelError(f"the model has format version {head.version}, this SDK knows {lib.SG_MODEL_VERSION}",
+        raise ModelError(f"the model has format version {head.version}, "
+                         f"this SDK knows {lib.SG_MODEL_VERSION}",
                          "fit the recording again with this SDK")
     if head.length > len(image):
         raise ModelError(f"the model is truncated: {len(image)} of {head.length} bytes", _AGAIN)
     if not 1 <= head.channels <= lib.SG_MODEL_CHANNELS:
-        raise ModelError(f"the model takes {head.channels} channels, a device has at most {lib.SG_MODEL_CHANNELS}",
+        raise ModelError(f"the model takes {head.channels} channels, "
+                         f"a device has at most {lib.SG_MODEL_CHANNELS}",
                          "fit a recording of this device")
     code = _open(image)
     if code != lib.SG_OK:
@@ -77,7 +81,7 @@ def stamp(image, generation):
 
 
 def choose_slot(info):
-    """(slot to write, generation to give) from a ModelInfo: never the slot that the device would start from."""
+    """(slot to write, generation to give) by a ModelInfo: never the slot that the device would start from."""
     valid = [slot for slot in (lib.SG_SLOT_A, lib.SG_SLOT_B) if info.verdict[slot] == lib.SG_OK]
     if not valid:
         return lib.SG_SLOT_A, 1
@@ -116,14 +120,16 @@ def _upload(link, image, progress):
     if info.active != slot or info.crc[slot] != crc:
         verdict = info.verdict[slot]
         raise DeviceError(verdict, "the device does not use the uploaded model "
-                          f"({ERROR_TEXT.get(verdict, 'another one is newer')})", "upload again; `sparsegaze info` shows both slots")
+                          f"({ERROR_TEXT.get(verdict, 'another one is newer')})",
+                          "upload again; `sparsegaze info` shows both slots")
     return UploadReport(slot, generation, crc, len(image), info.vectors[slot], link.now() - start)
 
 
 def _check_fit(image, hello):
     head = ffi.from_buffer("struct sg_model_head *", image)
     if head.version != hello.model_version:
-        raise ModelError(f"the model has format version {head.version}, the device takes {hello.model_version}",
+        raise ModelError(f"the model has format version {head.version}, "
+                         f"the device takes {hello.model_version}",
                          "run `sparsegaze flash` with the firmware of this SDK")
     if head.channels > hello.channels:
         raise ModelError(f"the model takes {head.channels} channels, the device has {hello.channels}",

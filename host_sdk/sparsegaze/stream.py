@@ -7,7 +7,8 @@ from . import wire
 from .clock import Unwrap
 from .wire import Counts, Gaze, Raw, lib
 
-_PARTS = {lib.SG_MSG_RAW: ("raw", Raw, lib.SG_STREAM_RAW), lib.SG_MSG_GAZE: ("gaze", Gaze, lib.SG_STREAM_GAZE),
+_PARTS = {lib.SG_MSG_RAW: ("raw", Raw, lib.SG_STREAM_RAW),
+          lib.SG_MSG_GAZE: ("gaze", Gaze, lib.SG_STREAM_GAZE),
           lib.SG_MSG_COUNTS: ("counts", Counts, lib.SG_STREAM_COUNTS)}
 
 
@@ -93,7 +94,8 @@ class Assembler:
         if len(self._done) >= self._keep:
             self._done.popleft()
             self.lost += 1
-        self._done.append(self._frame(seq=seq, t_us=t_us, host_time=self._host_time, raw=self._parts.get("raw"),
+        self._done.append(self._frame(seq=seq, t_us=t_us, host_time=self._host_time,
+                                      raw=self._parts.get("raw"),
                                       gaze=self._parts.get("gaze"), counts=self._parts.get("counts")))
         self._close()
 

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A byte stream to a board. Real ports, ptys and pyserial URLs run in real time (SerialLink); a registered unpaced
-virtual Nano runs in lockstep (LockstepLink): its time passes only inside read() and sleep(), so that a run depends on
-its seed and on the calls made, never on how fast this computer is.
+"""A byte stream to a board.
+
+Real ports, ptys and pyserial URLs run in real time (SerialLink). A registered unpaced virtual Nano runs in
+lockstep (LockstepLink): its time passes only inside read() and sleep(), so that a run depends on its seed and
+on the calls made, never on how fast this computer is.
 """
 
 import errno
@@ -14,8 +16,8 @@ from . import registry
 from .control import VirtualControl
 from .errors import DisconnectedError, PortError
 
-# What an operation on a port that went away raises: pyserial's SerialException is an OSError, its select() on a closed
-# handle raises TypeError, and termios.error is neither.
+# What an operation on a port that went away raises: pyserial's SerialException is an OSError, its select() on
+# a closed handle raises TypeError, and termios.error is neither.
 try:
     from termios import error as _termios_error
     _GONE = (OSError, TypeError, _termios_error)
@@ -32,7 +34,7 @@ LOCKSTEP_PATIENCE_S = 10.0      # real seconds in which sent bytes must show up
 
 
 def open_link(port, baud=1_000_000):
-    """Open `port` ("/dev/ttyUSB0", "COM3", "/dev/cu.usbserial-1", "/dev/pts/5", "socket://host:port", "loop://").
+    """Open `port`: "/dev/ttyUSB0", "COM3", "/dev/cu.usbserial-1", "/dev/pts/5", "socket://host:1234".
 
     The port is opened exclusively. Returns a Link. Raises PortError with a remedy.
     """
@@ -87,7 +89,8 @@ class SerialLink:
         try:
             self._port().write(data)
         except serial.SerialTimeoutException:
-            raise PortError(f"{self.port} takes no data", "is anything behind this port? `sparsegaze list`") from None
+            raise PortError(f"{self.port} takes no data",
+                            "is anything behind this port? `sparsegaze list`") from None
         except _GONE as error:
             raise self._gone(error) from None
 
@@ -104,7 +107,7 @@ class SerialLink:
         self.baud = int(baud)
 
     def reset(self):
-        """Reset the board into its bootloader. Returns False when this board has no way to be reset from here."""
+        """Reset the board into its bootloader. Returns False when it cannot be reset from here."""
         if not self.auto_reset:
             return False
         if self.control is not None:
@@ -176,7 +179,8 @@ class SerialLink:
         try:
             handle = self._port()
             # pyserial reconfigures the port on every change of timeout: a few fixed steps keep that rare.
-            slice_s = next((s for s in READ_SLICES_S if s <= remaining_s), 0 if remaining_s <= 0 else READ_SLICES_S[-1])
+            slice_s = next((s for s in READ_SLICES_S if s <= remaining_s),
+                           0 if remaining_s <= 0 else READ_SLICES_S[-1])
             if handle.timeout != slice_s:
                 handle.timeout = slice_s
             data = handle.read(1)
@@ -194,10 +198,10 @@ class SerialLink:
 
 
 class LockstepLink(SerialLink):
-    """A registered unpaced virtual Nano. now(), sleep() and every timeout are in virtual seconds since power-on."""
+    """A registered unpaced virtual Nano; now(), sleep() and timeouts are in its seconds since power-on."""
 
     def __init__(self, port, baud=1_000_000, control=None, auto_reset=True):
-        # The clock must already stand when the opening resets the board, or the start would depend on the host.
+        # The clock must already stand when the opening resets the board: the start would depend on the host.
         control.lockstep(True)      # byte counts start here
         super().__init__(port, baud, control, auto_reset)
         self._sent = 0
@@ -253,7 +257,7 @@ class LockstepLink(SerialLink):
                 raise DisconnectedError(f"{self.port} holds back bytes that the virtual Nano has sent",
                                         "is another program reading from this port?")
         if us > before and self._us <= before:
-            raise DisconnectedError(f"the clock of the virtual Nano behind {self.port} stands still (power is off)",
+            raise DisconnectedError(f"the virtual Nano behind {self.port} stands still (power is off)",
                                     "switch its power on again")
 
 
@@ -281,9 +285,11 @@ def _open_error(port, baud, error):
     if "exclusively lock" in text or "PermissionError" in text or number == errno.EBUSY:
         return PortError(f"{port} is in use by another program", "close that program and try again")
     if number == errno.EACCES:
-        return PortError(f"no permission to open {port}", "join the port's group (`sudo usermod -a -G dialout $USER`) and log in again")
+        return PortError(f"no permission to open {port}",
+                         "join the port's group (`sudo usermod -a -G dialout $USER`) and log in again")
     if isinstance(error, ValueError):
         return PortError(f"{port} cannot be opened at {baud} baud ({text})", "check the port's name")
-    if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or "Could not configure" in text or os.path.isfile(port):
+    not_serial = number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR) or "Could not configure" in text
+    if not_serial or os.path.isfile(port):
         return PortError(f"{port} is not a serial port", "`sparsegaze list` shows the ports there are")
     return PortError(f"cannot open {port} ({_reason(error)})", "`sparsegaze list` shows the ports there are")

@@ -25,7 +25,8 @@ try:
 except ImportError:             # Python < 3.11
     import tomli as tomllib
 
-__all__ = ["VirtualNano", "VirtualControl", "EyeState", "Section", "Time", "locate_vheadset", "locate_bootloader"]
+__all__ = ["VirtualNano", "VirtualControl", "EyeState", "Section", "Time", "locate_vheadset",
+           "locate_bootloader"]
 
 SOURCE_TREE = Path(__file__).resolve().parent.parent.parent
 BOOTLOADERS = {                 # name: (start address, file, variable that names another file)
@@ -53,7 +54,8 @@ class VirtualNano:
     app         .hex or .elf that is in flash already
     state_dir   keeps flash and EEPROM between runs; default: a fresh one, removed at the end
     ambient     "dark", "room", "bright_room", "sun_gap";  light: "nominal", "dim", "bright"
-    map         path of a response map (.sgmap) to use instead of simulating headset and person; False: no light at all
+    map         path of a response map (.sgmap) to use instead of simulating headset and person; False: no
+                light at all
     link        symbolic link to make to the port;  truth: CSV to write the eye's true state to
     physics     {"section.key": value} over the constants of physics.toml
     progress    handed to the response map's computation
@@ -62,9 +64,9 @@ class VirtualNano:
     Raises VirtualError.
     """
 
-    def __init__(self, headset=None, person=1, seed=None, unpaced=False, auto_reset=True, bootloader="optiboot",
-                 bootloader_start=None, app=None, state_dir=None, ambient="dark", light="nominal", map=None, link=None,
-                 truth=None, physics=None, progress=None):
+    def __init__(self, headset=None, person=1, seed=None, unpaced=False, auto_reset=True,
+                 bootloader="optiboot", bootloader_start=None, app=None, state_dir=None, ambient="dark",
+                 light="nominal", map=None, link=None, truth=None, physics=None, progress=None):
         binary = locate_vheadset()
         start, boot_hex = locate_bootloader(bootloader, bootloader_start)
         headset = Path(headset) if headset is not None else SOURCE_TREE / "headsets" / "led2gaze.toml"
@@ -78,9 +80,10 @@ class VirtualNano:
         state.mkdir(parents=True, exist_ok=True)
         control = folder / "control"
         settings = {
-            "bootloader": _absolute(boot_hex), "bootloader_start": f"0x{start:04X}", "state": _absolute(state),
-            "map": "none" if map is False else _absolute(map), "seed": int(person if seed is None else seed), "unpaced": int(bool(unpaced)),
-            "auto_reset": int(bool(auto_reset)), "control": control, "ambient": ambient, "light": light,
+            "bootloader": _absolute(boot_hex), "bootloader_start": f"0x{start:04X}",
+            "state": _absolute(state), "control": control, "map": "none" if map is False else _absolute(map),
+            "seed": int(person if seed is None else seed), "unpaced": int(bool(unpaced)),
+            "auto_reset": int(bool(auto_reset)), "ambient": ambient, "light": light,
         }
         for key, path in (("app", app), ("link", link), ("truth", truth)):
             if path is not None:
@@ -97,8 +100,9 @@ class VirtualNano:
         self.port = ready["port"]
         self.pid = self._process.pid
         self.control = VirtualControl(ready.get("control", str(control)))
-        self.entry = registry.Entry(self.port, None if link is None else _absolute(link), self.control.path, self.pid,
-                                    bool(unpaced), settings["seed"], int(person), os.fspath(headset), bool(auto_reset))
+        self.entry = registry.Entry(
+            self.port, None if link is None else _absolute(link), self.control.path, self.pid, bool(unpaced),
+            settings["seed"], int(person), os.fspath(headset), bool(auto_reset))
         registry.register(self.entry)
 
     def __enter__(self):
@@ -112,7 +116,7 @@ class VirtualNano:
         return self._process.poll() is None
 
     def wait(self, timeout_s=None):
-        """Until the simulator ends by itself. Returns its exit code, or None when it still runs after `timeout_s`."""
+        """Until the simulator ends by itself. Returns its exit code, or None after `timeout_s`."""
         try:
             return self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -131,11 +135,12 @@ class VirtualNano:
 
 
 def locate_vheadset():
-    """Path of the simulator program: $SPARSEGAZE_VHEADSET, or the source tree's, built when it is not there yet."""
+    """Path of the simulator program: $SPARSEGAZE_VHEADSET, or the source tree's, built when it is missing."""
     named = os.environ.get("SPARSEGAZE_VHEADSET")
     if named:
         if not os.access(named, os.X_OK):
-            raise VirtualError(f"SPARSEGAZE_VHEADSET names {named}, which is not a program", "correct or unset it")
+            raise VirtualError(f"SPARSEGAZE_VHEADSET names {named}, which is not a program",
+                               "correct or unset it")
         return Path(named)
     folder = SOURCE_TREE / "tools" / "vheadset"
     binary = folder / "vheadset"
@@ -147,7 +152,8 @@ def locate_vheadset():
     try:
         built = subprocess.run(["make", "-C", str(folder)], capture_output=True, text=True)
     except OSError as error:
-        raise VirtualError(f"the virtual Nano cannot be built ({error.strerror}: make)", "run `make setup`") from None
+        raise VirtualError(f"the virtual Nano cannot be built ({error.strerror}: make)",
+                           "run `make setup`") from None
     if built.returncode or not binary.is_file():
         reason = next((line for line in built.stderr.splitlines() if "rror" in line), "make failed")
         raise VirtualError(f"the virtual Nano cannot be built ({reason.strip()})", "run `make setup`")
@@ -159,7 +165,8 @@ def locate_bootloader(name="optiboot", start=None):
     key = os.fspath(name).lower()
     if key not in BOOTLOADERS:
         if not os.path.isfile(name):
-            raise VirtualError(f"no such bootloader: {name}", f"give {' or '.join(BOOTLOADERS)}, or a hex file")
+            raise VirtualError(f"no such bootloader: {name}",
+                               f"give {' or '.join(BOOTLOADERS)}, or a hex file")
         return (0x7E00 if start is None else int(start)), Path(name)
     address, relative, variable = BOOTLOADERS[key]
     named = os.environ.get(variable)
@@ -193,7 +200,8 @@ def _physics(binary, changes):
         sections = tomllib.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise VirtualError(f"cannot read {path} ({error})", "check the source tree out again") from None
-    flat = {f"{section}.{key}": value for section, values in sections.items() for key, value in values.items()}
+    flat = {f"{section}.{key}": value
+            for section, values in sections.items() for key, value in values.items()}
     unknown = sorted(set(changes) - set(flat))
     if unknown:
         raise VirtualError(f"there is no physical constant {unknown[0]}", f"see {path.name}")
@@ -205,10 +213,11 @@ def _start(binary, config, errors):
     """Start the simulator, wait for its ready line. Returns (process, parsed line)."""
     with open(errors, "wb") as stderr:
         try:
-            process = subprocess.Popen([str(binary), "--config", str(config)], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                                       stderr=stderr, start_new_session=True)
+            process = subprocess.Popen([str(binary), "--config", str(config)], stdin=subprocess.DEVNULL,
+                                       stdout=subprocess.PIPE, stderr=stderr, start_new_session=True)
         except OSError as error:
-            raise VirtualError(f"cannot start {binary} ({error.strerror})", "build it again: `make -C tools/vheadset`") from None
+            raise VirtualError(f"cannot start {binary} ({error.strerror})",
+                               "build it again: `make -C tools/vheadset`") from None
     line, deadline = b"", time.monotonic() + READY_TIMEOUT_S
     while not line.endswith(b"\n"):
         ready, _, _ = select.select([process.stdout], [], [], max(0.0, deadline - time.monotonic()))
@@ -219,7 +228,7 @@ def _start(binary, config, errors):
             process.stdout.close()
             reason = errors.read_text(errors="replace").strip().splitlines()
             raise VirtualError("the virtual Nano did not start: " + (reason[0] if reason else
-                               "it ended without a word" if ready else f"not ready after {READY_TIMEOUT_S:g} s"),
+                               "it ended without a word" if ready else f"silent for {READY_TIMEOUT_S:g} s"),
                                "`sparsegaze doctor` shows what is missing")
         line += part
     try:
@@ -228,7 +237,8 @@ def _start(binary, config, errors):
     except (ValueError, KeyError, TypeError):
         process.kill()
         process.wait()
-        raise VirtualError(f"the virtual Nano said {line[:80]!r} instead of its port", "build it again: `make -C tools/vheadset`") from None
+        raise VirtualError(f"the virtual Nano said {line[:80]!r} instead of its port",
+                           "build it again: `make -C tools/vheadset`") from None
     return process, parsed
 
 
@@ -253,5 +263,6 @@ def _clean(folder):
 def _absolute(path):
     text = os.path.abspath(os.fspath(path))
     if "\n" in text or "#" in text:
-        raise VirtualError(f"the virtual Nano cannot take the path {text!r}", "use one without '#' or line breaks")
+        raise VirtualError(f"the virtual Nano cannot take the path {text!r}",
+                           "use one without '#' or line breaks")
     return text

@@ -19,10 +19,12 @@ Packet = namedtuple("Packet", "type seq body")
 
 ERROR_TEXT = {
     lib.SG_E_ARG: "an argument is outside its range", lib.SG_E_RANGE: "a result saturated",
-    lib.SG_E_MAGIC: "there is no stored model", lib.SG_E_VERSION: "the stored model has another format version",
+    lib.SG_E_MAGIC: "there is no stored model",
+    lib.SG_E_VERSION: "the stored model has another format version",
     lib.SG_E_BOUNDS: "a length, count or index is out of bounds", lib.SG_E_CRC: "a checksum does not match",
     lib.SG_E_SHORT: "the data end too early", lib.SG_E_UNKNOWN: "this firmware does not know the request",
-    lib.SG_E_STATE: "the request does not fit the present state", lib.SG_E_BUSY: "an earlier request is under way",
+    lib.SG_E_STATE: "the request does not fit the present state",
+    lib.SG_E_BUSY: "an earlier request is under way",
 }
 
 
@@ -116,8 +118,10 @@ Verdict = record("struct sg_model_verdict", "Verdict")
 Mode = record("struct sg_mode", "Mode")
 ModelAt = record("struct sg_model_at", "ModelAt")
 
-_STRUCT = {Hello: "struct sg_hello", Status: "struct sg_status", Gaze: "struct sg_gaze", Pong: "struct sg_pong",
-           Raw: "struct sg_raw", Counts: "struct sg_counts", ModelInfo: "struct sg_model_info", Mode: "struct sg_mode",
+_STRUCT = {Hello: "struct sg_hello", Status: "struct sg_status", Gaze: "struct sg_gaze",
+           Pong: "struct sg_pong",
+           Raw: "struct sg_raw", Counts: "struct sg_counts", ModelInfo: "struct sg_model_info",
+           Mode: "struct sg_mode",
            Verdict: "struct sg_model_verdict", Exposure: "struct sg_exposure", Recentre: "struct sg_recentre",
            ModelAt: "struct sg_model_at"}
 _SIZE = {kind: ffi.sizeof(name) for kind, name in _STRUCT.items()}
@@ -131,7 +135,7 @@ class HelloPrefix(NamedTuple):
 
 
 def parse(kind, body):
-    """The record `kind` from a message body. A longer body is accepted, its excess ignored. Raises ProtocolError."""
+    """The record `kind` from a message body, any excess ignored. Raises ProtocolError if it is short."""
     if len(body) < _SIZE[kind]:
         raise ProtocolError(f"the device sent {len(body)} bytes where {kind.__name__} takes {_SIZE[kind]}",
                             "flash the firmware that belongs to this SDK: `sparsegaze flash PORT`")
@@ -154,7 +158,7 @@ def body(struct, **fields):
 
 
 def data_body(slot, offset, data):
-    """The bytes of struct sg_model_data holding `data` (at most SG_WIRE_DATA_MAX bytes); no more of it travels."""
+    """The bytes of struct sg_model_data with `data` (at most SG_WIRE_DATA_MAX bytes), no unused room."""
     value = ffi.new("struct sg_model_data *", {"offset": offset, "slot": slot, "length": len(data)})
     ffi.memmove(value.data, data, len(data))
     return bytes(ffi.buffer(value))[:ffi.offsetof("struct sg_model_data", "data") + len(data)]
@@ -211,7 +215,8 @@ class Decoder:
             self.heard += data[:64 - len(self.heard)]
         start, buffer = 0, ffi.from_buffer("uint8_t[]", data)
         while start < len(data):
-            n = lib.sg_link_feed(self._rx, buffer + start, len(data) - start, self._used, self._head, self._body)
+            n = lib.sg_link_feed(self._rx, buffer + start, len(data) - start, self._used, self._head,
+                                 self._body)
             start += self._used[0]
             if n >= 0:
                 self.good += 1

@@ -16,7 +16,8 @@ def make_image(seed, vectors=64, generation=0):
     """Bytes of a valid model with arbitrary numbers drawn from `seed`."""
     rng = np.random.default_rng(seed)
     model = DeviceModel.from_parts(
-        offset=rng.integers(0, 30000, 6), gain_q12=rng.integers(200, 4000, 6), bias=rng.integers(-(1 << 24), 1 << 24, 2),
+        offset=rng.integers(0, 30000, 6), gain_q12=rng.integers(200, 4000, 6),
+        bias=rng.integers(-(1 << 24), 1 << 24, 2),
         trend=rng.integers(-2000, 2000, (2, 6)), centres=rng.integers(0, 256, (vectors, 6)),
         weights=rng.integers(-3000, 3000, (vectors, 2)), weight_frac_bits=8,
         guards=[(-(1 << 20), 1 << 20, rng.integers(-100, 100, 6)) for _ in range(3)], generation=generation)

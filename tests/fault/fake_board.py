@@ -93,7 +93,8 @@ class FakeBoard(PtyPeer):
     signature  of the chip
     """
 
-    def __init__(self, boot_speed=termios.B115200, hello=None, cut_after=None, signature=b"\x1e\x95\x0f", deaf_first=0,
+    def __init__(self, boot_speed=termios.B115200, hello=None, cut_after=None, signature=b"\x1e\x95\x0f",
+                 deaf_first=0,
                  disturb=None):
         self.flash = bytearray(b"\xff" * 0x8000)
         self.boot_speed = boot_speed
@@ -104,8 +105,10 @@ class FakeBoard(PtyPeer):
         self.writes = []
         self.requests = []
         self.answers = 0
-        self.hello = dict(firmware=0x000100, slot_bytes=lib.SG_MODEL_SLOT_BYTES, slot_base=[0x6000, 0x6C00], cpu_hz=16000000,
-                          wire_version=lib.SG_WIRE_VERSION, model_version=lib.SG_MODEL_VERSION, frame_period_us=3600,
+        self.hello = dict(firmware=0x000100, slot_bytes=lib.SG_MODEL_SLOT_BYTES, slot_base=[0x6000, 0x6C00],
+                          cpu_hz=16000000,
+                          wire_version=lib.SG_WIRE_VERSION, model_version=lib.SG_MODEL_VERSION,
+                          frame_period_us=3600,
                           exposure_min_us=20, exposure_max_us=280, page_bytes=128, trial_bytes=880,
                           board=lib.SG_BOARD_NANO328P, channels=6)
         self.hello.update(hello or {})
@@ -123,7 +126,7 @@ class FakeBoard(PtyPeer):
             for packet in self._decoder.feed(data):
                 self._application(packet)
 
-    # bootloader -----------------------------------------------------------------------------------------------------
+    # bootloader ---------------------------------------------------------------------------------------------
 
     def _bootloader(self):
         command = self._stk[0]
@@ -151,7 +154,7 @@ class FakeBoard(PtyPeer):
         self.say(b"\x14" + body + b"\x10")
         return True
 
-    # application ----------------------------------------------------------------------------------------------------
+    # application --------------------------------------------------------------------------------------------
 
     def _application(self, packet):
         self.requests.append(packet)
@@ -180,7 +183,8 @@ class FakeBoard(PtyPeer):
         for slot, base in enumerate(self.hello["slot_base"]):
             image = bytes(self.flash[base:base + lib.SG_MODEL_SLOT_BYTES])
             head = ffi.from_buffer("struct sg_model_head *", image)
-            info["verdict"][slot] = lib.sg_model_open(ffi.new("struct sg_model_view *"), ffi.from_buffer(image), len(image), 0)
+            info["verdict"][slot] = lib.sg_model_open(ffi.new("struct sg_model_view *"),
+                                                      ffi.from_buffer(image), len(image), 0)
             if info["verdict"][slot] == lib.SG_OK:
                 info["crc"][slot], info["generation"][slot] = head.crc, head.generation
                 info["vectors"][slot], info["channels"][slot] = head.vectors, head.channels

@@ -19,7 +19,8 @@ def _impatient(monkeypatch):
 
 
 def packets():
-    bodies = [b"", b"\0", b"\0" * 64, bytes(range(64)), wire.body("struct sg_gaze", t_us=1234567, azimuth_deg_q7=-5)]
+    bodies = [b"", b"\0", b"\0" * 64, bytes(range(64)),
+              wire.body("struct sg_gaze", t_us=1234567, azimuth_deg_q7=-5)]
     return [wire.encode(0x40 + i, 1000 + i, body) for i, body in enumerate(bodies)]
 
 
@@ -30,14 +31,17 @@ def test_every_single_byte_fault_at_every_offset_is_over_within_one_frame(fault)
     good = wire.Decoder().feed(line)
     assert len(good) == len(frames)
     for at in range(len(line) - len(frames[-1])):
-        broken = {"drop": line[:at] + line[at + 1:], "flip": line[:at] + bytes([line[at] ^ 0x10]) + line[at + 1:],
+        broken = {"drop": line[:at] + line[at + 1:],
+                  "flip": line[:at] + bytes([line[at] ^ 0x10]) + line[at + 1:],
                   "double": line[:at + 1] + line[at:], "zero": line[:at] + b"\0" + line[at + 1:],
                   "insert zero": line[:at] + b"\0" + line[at:]}[fault]
         hit = line[:at].count(b"\0")
-        # A damaged delimiter joins two frames; no other frame may suffer, and nothing may arrive that was not sent.
+        # A damaged delimiter joins two frames; no other frame may suffer, and nothing may arrive that was
+        # not sent.
         harmed = good[hit:hit + 2] if line[at] == 0 else good[hit:hit + 1]
         seen = wire.Decoder().feed(broken)
-        assert [packet for packet in seen if packet not in harmed] == [packet for packet in good if packet not in harmed]
+        intact = [packet for packet in good if packet not in harmed]
+        assert [packet for packet in seen if packet not in harmed] == intact
 
 
 def test_feeding_byte_by_byte_equals_feeding_at_once():
@@ -53,7 +57,8 @@ def test_lost_requests_are_sent_again_with_the_same_number():
         board.deaf_first = len(board.requests) + 2
         device.model_info()
         last = board.requests[-3:]
-        assert {packet.type for packet in last} == {lib.SG_MSG_MODEL_INFO} and len({packet.seq for packet in last}) == 1
+        assert {packet.type for packet in last} == {lib.SG_MSG_MODEL_INFO}
+        assert len({packet.seq for packet in last}) == 1
 
 
 def test_a_device_that_falls_silent_is_given_up_after_three_tries():
@@ -92,7 +97,8 @@ def test_a_refusal_carries_its_code_and_an_explanation():
         with pytest.raises(DeviceError) as caught:
             device.status()
         assert caught.value.code == lib.SG_E_UNKNOWN
-        assert "does not know the request" in caught.value.message and "sparsegaze flash" in caught.value.remedy
+        assert "does not know the request" in caught.value.message
+        assert "sparsegaze flash" in caught.value.remedy
 
 
 def test_a_short_answer_is_a_protocol_error_not_garbage():
@@ -128,10 +134,12 @@ def test_pipelined_inference_keeps_the_order_when_answers_are_lost_busy_or_swapp
                 return None
             if n % 5 == 0:
                 return self.say(wire.encode(lib.SG_MSG_ERROR, packet.seq,
-                                            wire.body("struct sg_error", error=lib.SG_E_BUSY, type=packet.type)))
+                                            wire.body("struct sg_error", error=lib.SG_E_BUSY,
+                                                      type=packet.type)))
             first = packet.body[0] | packet.body[1] << 8
             answer = wire.encode(packet.type | lib.SG_REPLY, packet.seq,
-                                 wire.body("struct sg_gaze", azimuth_deg_q7=first, elevation_deg_q7=-first, flags=1))
+                                 wire.body("struct sg_gaze", azimuth_deg_q7=first, elevation_deg_q7=-first,
+                                           flags=1))
             if n % 3 == 0 and self.held is None:
                 self.held = answer
                 return None
@@ -142,5 +150,6 @@ def test_pipelined_inference_keeps_the_order_when_answers_are_lost_busy_or_swapp
         features = np.zeros((40, 6), np.uint16)
         features[:, 0] = np.arange(40) * 128
         gaze = device.infer(features)
-        assert gaze.azimuth_deg.tolist() == list(range(40)) and gaze.elevation_deg.tolist() == [-i for i in range(40)]
+        assert gaze.azimuth_deg.tolist() == list(range(40))
+        assert gaze.elevation_deg.tolist() == [-i for i in range(40)]
         assert (gaze.flags == 1).all()

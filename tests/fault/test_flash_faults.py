@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hex files that must not be flashed, bootloaders that do not answer as hoped, cables pulled while flashing."""
+"""Hex files not to be flashed, bootloaders that do not answer as hoped, cables pulled while flashing."""
 
 import termios
 
@@ -39,7 +39,8 @@ def test_every_kind_of_damage_to_a_hex_line_is_found(program, tmp_path):
         line = lines[row]
         column = min(column, len(line) - 1)
         other = rng.choice([c for c in "0123456789ABCDEF" if c != line[column]])
-        path.write_text("\n".join(lines[:row] + [line[:column] + other + line[column + 1:]] + lines[row + 1:]) + "\n")
+        changed = line[:column] + other + line[column + 1:]
+        path.write_text("\n".join(lines[:row] + [changed] + lines[row + 1:]) + "\n")
         assert "is corrupt" in refused(path)
 
 
@@ -121,7 +122,7 @@ def test_cable_pulled_after_any_page_leaves_no_half_program_that_runs(program, a
     with pytest.raises(DisconnectedError) as caught:
         flash_hex(board.port, program[0])
     assert "not finished" in caught.value.message and "stored models are untouched" in caught.value.remedy
-    # Of page 0 there is nothing, the parking loop, or a torn page in the very last step: never an old start of a new program.
+    # Of page 0 there is a torn page or the parking loop, never an old start of a new program.
     assert board.flash[:128] in (b"\0" * 128, PARKED)
     assert set(board.flash[1024:]) == {255}
 

@@ -106,7 +106,8 @@ def test_pulled_cable_during_a_read_is_a_disconnection_with_a_remedy():
 
 
 def test_pulled_cable_is_noticed_by_every_operation():
-    for operation in (lambda link: link.write(b"x" * 64), lambda link: link.read(1, 0.1), lambda link: link.set_baud(57600),
+    for operation in (lambda link: link.write(b"x" * 64), lambda link: link.read(1, 0.1),
+                      lambda link: link.set_baud(57600),
                       lambda link: link.flush_input(), lambda link: link.reset()):
         peer = PtyPeer()
         link = open_link(peer.port)
@@ -146,7 +147,8 @@ def test_registry_forgets_dead_simulators_and_survives_garbage(tmp_path):
     folder = registry.directory()
     (folder / "1.json").write_text("{ not json")
     (folder / "2.json").write_text('{"port": 5}')
-    dead = registry.Entry("/dev/pts/99999", None, str(tmp_path / "control"), 2 ** 22 - 1, True, 1, 1, "x.toml", True)
+    dead = registry.Entry("/dev/pts/99999", None, str(tmp_path / "control"), 2 ** 22 - 1, True, 1, 1,
+                          "x.toml", True)
     registry.register(dead)
     assert registry.entries() == []
     assert list(folder.glob("*.json")) == []
@@ -157,7 +159,8 @@ def test_registry_finds_a_virtual_port_by_its_link_and_lists_it(tmp_path):
         control, link = tmp_path / "control", tmp_path / "nano"
         control.touch()
         link.symlink_to(peer.port)
-        entry = registry.Entry(peer.port, str(link), str(control), os.getpid(), False, 3, 4, "headsets/ring.toml", False)
+        entry = registry.Entry(peer.port, str(link), str(control), os.getpid(), False, 3, 4,
+                               "headsets/ring.toml", False)
         registry.register(entry)
         try:
             assert registry.find(str(link)) == entry == registry.find(peer.port)

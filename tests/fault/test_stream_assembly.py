@@ -14,7 +14,8 @@ PERIOD_US = 3600
 
 
 def packet(kind, seq, t_us):
-    struct = {lib.SG_MSG_RAW: "struct sg_raw", lib.SG_MSG_GAZE: "struct sg_gaze", lib.SG_MSG_COUNTS: "struct sg_counts"}[kind]
+    struct = {lib.SG_MSG_RAW: "struct sg_raw", lib.SG_MSG_GAZE: "struct sg_gaze",
+              lib.SG_MSG_COUNTS: "struct sg_counts"}[kind]
     return wire.Packet(kind, seq & 0xFFFF, wire.body(struct, t_us=t_us & 0xFFFFFFFF))
 
 
@@ -50,7 +51,8 @@ def test_device_time_wraps_after_71_minutes_and_goes_on():
 
 
 def test_a_missing_part_makes_an_incomplete_frame_not_a_lost_one():
-    frames, done = assembled(both(1, 0) + both(2, PERIOD_US)[:1] + both(3, 2 * PERIOD_US)[1:] + both(4, 3 * PERIOD_US))
+    second, third = both(2, PERIOD_US), both(3, 2 * PERIOD_US)
+    frames, done = assembled(both(1, 0) + second[:1] + third[1:] + both(4, 3 * PERIOD_US))
     assert [frame.seq for frame in done] == [1, 2, 3, 4]
     assert done[1].gaze is None and done[2].raw is None
     assert (frames.lost, frames.incomplete) == (0, 2)
@@ -62,7 +64,8 @@ def test_a_doubled_packet_does_not_make_a_second_frame():
 
 
 def test_a_restart_of_the_device_is_counted_and_time_never_runs_backwards():
-    frames, done = assembled(both(500, 500 * PERIOD_US) + both(0, 10) + both(1, 10 + PERIOD_US) + both(3, 10 + 3 * PERIOD_US))
+    before, after = both(500, 500 * PERIOD_US), both(0, 10) + both(1, 10 + PERIOD_US)
+    frames, done = assembled(before + after + both(3, 10 + 3 * PERIOD_US))
     assert frames.restarts == 1 and frames.lost == 1
     assert [frame.seq for frame in done] == [500, 501, 502, 504]
     assert np.all(np.diff([frame.t_us for frame in done]) > 0)
@@ -90,7 +93,8 @@ def pings(clock, n, offset_s, drift, jitter_s, start_us=0, every_s=1.0, seed=1):
         device_s = start_us * 1e-6 + i * every_s
         host = offset_s + (1 + drift) * device_s
         there, back = 50e-6 + rng.exponential(jitter_s, 2)
-        clock.add(host - there, host + 100e-6 + back, int(device_s * 1e6) & 0xFFFFFFFF, int(device_s * 1e6 + 100) & 0xFFFFFFFF)
+        clock.add(host - there, host + 100e-6 + back, int(device_s * 1e6) & 0xFFFFFFFF,
+                  int(device_s * 1e6 + 100) & 0xFFFFFFFF)
 
 
 def test_clock_finds_one_percent_of_drift_under_jitter_of_a_millisecond():

@@ -105,7 +105,8 @@ def test_cable_pulled_after_any_page_leaves_the_old_model_bit_for_bit(after):
         again.flash[:] = board.flash
         with device_module.Device(again.port) as device:
             info = device.model_info()
-            assert info.active == 0 and info.crc[0] == ffi.from_buffer("struct sg_model_head *", flash[0x6000:0x6080]).crc
+            assert info.active == 0 and info.crc[0] == ffi.from_buffer("struct sg_model_head *",
+                                                                       flash[0x6000:0x6080]).crc
             assert info.verdict[1] != lib.SG_OK
         assert store.upload(again.port, new).slot == 1      # and the next upload succeeds
 

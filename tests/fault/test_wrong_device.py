@@ -33,7 +33,8 @@ def test_nothing_behind_the_port_is_tried_at_both_speeds():
             Device(peer.port)
         assert set(peer.speeds) == {termios.B1000000, termios.B500000}
         assert peer.speeds[0] == termios.B1000000
-        assert 4 <= len(peer.speeds) <= (CONNECT_S - BOOT_WAIT_S) / 0.25 + 1      # polite: about four a second
+        # polite: about four a second
+        assert 4 <= len(peer.speeds) <= (CONNECT_S - BOOT_WAIT_S) / 0.25 + 1
 
 
 def test_foreign_firmware_is_told_from_silence_and_its_bytes_are_shown():
