@@ -434,3 +434,9 @@ int sim_map_eval(const struct sim_map *map, const struct sim_state *state, doubl
     }
     return bad;
 }
+
+int sim_map_eval_many(const struct sim_map *map, const struct sim_state *states, size_t n, double *out) {
+    int bad = 0;
+    for (size_t i = 0; i < n; ++i) bad += sim_map_eval(map, &states[i], out + i * (size_t)map->pairs) != 0;
+    return bad;
+}

@@ -9,14 +9,14 @@
 #define PI 3.14159265358979323846
 
 struct sim_quality sim_quality_default(void) {
-    struct sim_quality q = {.lid_alpha = 56,
-                            .lid_beta = 44,
+    struct sim_quality q = {.lid_alpha = 80,
+                            .lid_beta = 64,
                             .iris_ring = 4,
                             .iris_edge = 10,
                             .iris_phi = 64,
-                            .glint_theta_deg = 0.35,
-                            .glint_lobe = 0.8,
-                            .face_step_mm = 0.4};
+                            .glint_theta_deg = 0.5,
+                            .glint_lobe = 1.0,
+                            .face_step_mm = 0.3};
     return q;
 }
 
@@ -222,13 +222,16 @@ static int add_iris(const struct sim_scene *scene, const double axes[9], double 
         int last = p == n_pupils - 1, n = last ? q->iris_edge : q->iris_ring;
         const double *gauss = scene->gauss[last ? 3 : 2];
         double from = pupil_mm[p] / 2, to = last ? eye->limbus : pupil_mm[p + 1] / 2;
-        for (int i = 0; i < n; ++i) {
-            double r = (from + to) / 2 + (to - from) / 2 * gauss[i];
-            double weight = (to - from) / 2 * gauss[n + i] * r * 2 * PI / q->iris_phi * albedo;
+        // The edge nodes are meant for the outermost 2 mm or so, where the cornea ends.
+        int panels = (int)ceil((to - from) / 2);
+        double half = (to - from) / (2 * panels);
+        for (int i = 0; i < n * panels; ++i) {
+            double r = from + half * (2 * (i / n) + 1 + gauss[i % n]);
+            double weight = half * gauss[n + i % n] * r * 2 * PI / q->iris_phi * albedo;
             for (int j = 0; j < q->iris_phi; ++j) {
                 double phi = 2 * PI * (j + 0.5) / q->iris_phi;
                 double spot[3] = {r * cos(phi), r * sin(phi), eye->iris_z};
-                add_iris_spot(scene, axes, (const double (*)[3])sites_eye, spot, weight, lids, n_lids, ring);
+                add_iris_spot(scene, axes, (const double(*)[3])sites_eye, spot, weight, lids, n_lids, ring);
             }
         }
         for (int k = 0; k < block; ++k) out[(size_t)p * (size_t)block + (size_t)k] += ring[k];

@@ -33,7 +33,7 @@ struct sim_port {
 // How finely to integrate. NULL anywhere below means sim_quality_default().
 struct sim_quality {
     int lid_alpha, lid_beta;   // Gauss-Legendre nodes over the opening, across and from margin to margin
-    int iris_ring, iris_edge;  // nodes in radius between two pupil edges; from the last one to the limbus
+    int iris_ring, iris_edge;  // nodes in radius between pupil edges; from the last to the limbus,
     int iris_phi;              // nodes around
     double glint_theta_deg;    // step of the profile
     double glint_lobe;         // step around the axis, in lobe widths

@@ -4,6 +4,7 @@
 Optional: the SDK streams and calibrates without it; only simulate.py needs it. Wants a C compiler and
 Embree 3 (Debian: libembree-dev)."""
 
+import hashlib
 import os
 import re
 import shutil
@@ -27,13 +28,24 @@ def cdef_regions():
     return re.sub(r"//[^\n]*", "", "\n".join(text))
 
 
+def source_hash():
+    """SHA-256 of every source: maps made by another version of the simulator are not found in the cache."""
+    digest = hashlib.sha256()
+    for name in sorted(os.listdir(SIM_C)):
+        if name.endswith((".c", ".h")) and not name.startswith("sim_map"):
+            with open(os.path.join(SIM_C, name), "rb") as file:
+                digest.update(name.encode() + b"\0" + file.read())
+    return digest.hexdigest()
+
+
 def builder():
     """The configured FFI object."""
     ffi = FFI()
-    ffi.cdef(cdef_regions())
+    ffi.cdef(cdef_regions() + "\nextern const char sim_source_hash[];\n")
     ffi.set_source(
         "sparsegaze._sim",
-        "\n".join('#include "%s"' % name for name in HEADERS),
+        "\n".join('#include "%s"' % name for name in HEADERS)
+        + '\nconst char sim_source_hash[] = "%s";\n' % source_hash(),
         sources=[os.path.join(SIM_C, name) for name in SOURCES],
         include_dirs=[SIM_C],
         libraries=["embree3", "m"],

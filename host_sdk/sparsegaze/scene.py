@@ -7,7 +7,7 @@ import numpy as np
 from .errors import SceneError
 from .person import Person
 
-TERMS = {"face": 1, "sclera": 2, "iris": 4, "smooth": 7}
+TERMS = {"face": 1, "sclera": 2, "iris": 4, "eye": 6, "smooth": 7}
 
 
 def simulator():
