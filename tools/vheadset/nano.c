@@ -1,0 +1,240 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+#include "nano.h"
+
+#include <errno.h>
+#include <stdio.h>
+#include <string.h>
+
+#include "../../sim_c/sim_map.h"
+#include "access.h"
+#include "hexfile.h"
+#include "images.h"
+#include "noise.h"
+
+enum { MCUSR = 0x54, SRAM = 0x100, SRAM_END = 0x900, BATCH_CYCLES = 16000 };
+static const char FLASH_IMAGE[] = "flash.bin", EEPROM_IMAGE[] = "eeprom.bin";
+
+// Of libsimavr; exported but not declared in an installed header.
+avr_flashaddr_t avr_run_one(avr_t *avr);
+
+// One batch of instructions, up to the next timer or interrupt. Replaces libsimavr's loop, which sleeps in real time
+// and overshoots a sleep by a cycle.
+static void run_batch(avr_t *avr)
+{
+    struct nano *nano = (struct nano *)access_module(avr, "nano");
+    avr_flashaddr_t pc = avr->pc;
+    if (avr->state == cpu_Running)
+        pc = avr_run_one(avr);
+    avr_cycle_count_t idle = avr_cycle_timer_process(avr);
+    avr->pc = pc;
+    if (avr->state == cpu_Sleeping) {
+        nano->markers.slept = true;
+        avr->cycle += idle;
+        idle = avr_cycle_timer_process(avr);
+    } else if (avr->state != cpu_Running) {
+        // The program ran off the end or into nonsense: only the watchdog or a reset helps.
+        if (avr->state != cpu_Stopped)
+            nano->crashes++;
+        avr->state = cpu_Stopped;
+        avr->cycle += idle ? idle : 1;
+        return;
+    }
+    if (avr->state != cpu_Sleeping && avr->interrupt_state) {
+        avr_service_interrupts(avr);
+        avr_cycle_timer_process(avr);  // an entry takes cycles: the next batch must still end at its timer
+    }
+    if (avr->state == cpu_Running && !avr->interrupt_state)
+        nano->markers.slept = false;
+}
+
+static avr_cycle_count_t stop_here(avr_t *avr, avr_cycle_count_t when, void *param)
+{
+    (void)avr, (void)when, (void)param;
+    return 0;
+}
+
+static void on_reset(avr_io_t *io)
+{
+    ((struct nano *)io)->reset_seen = true;
+}
+
+// What avr_reset() leaves undone or undoes.
+static void after_reset(struct nano *nano, enum nano_reset cause)
+{
+    avr_t *avr = nano->avr;
+    nano->reset_seen = false;
+    nano->resets++;
+    if (cause == NANO_RESET_WATCHDOG)
+        nano->watchdog_resets++;
+    nano->reset_flags = cause == NANO_RESET_POWER ? NANO_RESET_POWER : nano->reset_flags | (uint8_t)cause;
+    avr->data[MCUSR] = nano->reset_flags;
+    avr->run = run_batch;
+    avr->run_cycle_limit = BATCH_CYCLES;
+    timer1_reset(&nano->timer1);
+    adc_reset(&nano->adc);
+    eeprom_reset(&nano->eeprom);
+    selfprog_reset(&nano->selfprog);
+    leds_reset(&nano->leds, cause == NANO_RESET_POWER);
+    markers_reset(&nano->markers);
+    uart_reset(&nano->uart);
+}
+
+static void write_mcusr(avr_t *avr, avr_io_addr_t at, uint8_t value, void *param)
+{
+    struct nano *nano = param;
+    nano->reset_flags &= value;  // flags are cleared by writing zeros and cannot be set
+    avr->data[at] = nano->reset_flags;
+}
+
+void nano_press_reset(struct nano *nano)
+{
+    if (!nano->powered)
+        return;
+    avr_reset(nano->avr);
+    after_reset(nano, NANO_RESET_EXTERNAL);
+    bridge_flush_to_host(nano->bridge);
+}
+
+static void power_on(struct nano *nano)
+{
+    avr_t *avr = nano->avr;
+    uint64_t n = nano->power_ons++ * SRAM_END;
+    nano->powered = true;
+    avr_reset(avr);
+    for (int i = 0; i < SRAM_END; i++)
+        if (i < 32 || i >= SRAM)
+            avr->data[i] = (uint8_t)noise_bits(nano->config.seed, NOISE_SRAM, n + (uint64_t)i);
+    after_reset(nano, NANO_RESET_POWER);
+}
+
+int nano_power(struct nano *nano, bool on)
+{
+    if (on == nano->powered)
+        return 0;
+    if (on) {
+        power_on(nano);
+        return 0;
+    }
+    eeprom_cut(&nano->eeprom, nano->config.seed);
+    selfprog_cut(&nano->selfprog, nano->config.seed);
+    nano->powered = false;
+    nano->bridge->to_device.used = 0;
+    nano->cut_cycle = UINT64_MAX;
+    return nano_save(nano);
+}
+
+int nano_save(struct nano *nano)
+{
+    if (nano->selfprog.dirty) {
+        if (images_save(nano->config.state, FLASH_IMAGE, nano->selfprog.flash, FLASH_BYTES))
+            return -1;
+        nano->selfprog.dirty = false;
+    }
+    if (nano->eeprom.dirty) {
+        if (images_save(nano->config.state, EEPROM_IMAGE, nano->eeprom.data, EEPROM_BYTES))
+            return -1;
+        nano->eeprom.dirty = false;
+    }
+    return 0;
+}
+
+void nano_run_until(struct nano *nano, uint64_t cycle)
+{
+    avr_t *avr = nano->avr;
+    while (avr->cycle < cycle || avr->cycle >= nano->cut_cycle) {
+        if (avr->cycle >= nano->cut_cycle)
+            nano_power(nano, false);
+        if (!nano->powered) {
+            nano->bridge->to_device.used = 0;
+            if (avr->cycle < cycle)
+                avr->cycle = cycle;
+            return;
+        }
+        uint64_t limit = cycle < nano->cut_cycle ? cycle : nano->cut_cycle;
+        access_at(avr, limit, stop_here, nano);
+        while (avr->cycle < limit && !nano->reset_seen)
+            avr->run(avr);
+        avr_cycle_timer_cancel(avr, stop_here, nano);
+        if (nano->reset_seen)
+            after_reset(nano, NANO_RESET_WATCHDOG);
+    }
+}
+
+static void silent(avr_t *avr, const int level, const char *format, va_list list)
+{
+    (void)avr, (void)level, (void)format, (void)list;
+}
+
+static int load(struct nano *nano, char *error, size_t error_bytes)
+{
+    const struct config *c = &nano->config;
+    uint8_t *flash = nano->selfprog.flash, boot[2 * FLASH_BYTES], before[FLASH_BYTES];
+    if (images_load(c->state, FLASH_IMAGE, flash, FLASH_BYTES, error, error_bytes)
+        || images_load(c->state, EEPROM_IMAGE, nano->eeprom.data, EEPROM_BYTES, error, error_bytes))
+        return -1;
+    memcpy(before, flash, sizeof before);
+    if (*c->bootloader) {
+        // Room behind the flash: Debian's build of Optiboot has 20 bytes more than its section (README.md).
+        memset(boot, 0xFF, sizeof boot);
+        if (hexfile_load(c->bootloader, boot, sizeof boot, error, error_bytes) < 0)
+            return -1;
+        memcpy(flash + c->bootloader_start, boot + c->bootloader_start, FLASH_BYTES - c->bootloader_start);
+    }
+    if (*c->app
+        && hexfile_load(c->app, flash, *c->bootloader ? c->bootloader_start : FLASH_BYTES, error, error_bytes) < 0)
+        return -1;
+    nano->selfprog.dirty = memcmp(before, flash, sizeof before) != 0;
+    return 0;
+}
+
+int nano_open(struct nano *nano, const struct config *config, struct bridge *bridge, char *error,
+              size_t error_bytes)
+{
+    memset(nano, 0, sizeof *nano);
+    nano->config = *config;
+    nano->bridge = bridge;
+    nano->cut_cycle = UINT64_MAX;
+    nano->cycles_per_true_second = 16e6 * (1 + config->physics.clock.error
+                                           * (2 * noise_uniform(config->seed, NOISE_CLOCK, 0) - 1));
+    if (*config->map) {
+        nano->map = sim_map_open(config->map, error, error_bytes);
+        if (!nano->map)
+            return -1;
+        if (sim_map_sensors(nano->map) != LEDS_COUNT || sim_map_emitters(nano->map) != LEDS_COUNT) {
+            snprintf(error, error_bytes, "%s is not a map of %d sensors and emitters", config->map, LEDS_COUNT);
+            return -1;
+        }
+    }
+    avr_global_logger_set(silent);
+    avr_t *avr = avr_make_mcu_by_name("atmega328p");
+    if (!avr || avr_init(avr)) {
+        snprintf(error, error_bytes, "libsimavr has no atmega328p");
+        return -1;
+    }
+    nano->avr = avr;
+    avr->frequency = 16000000;
+    avr->codeend = avr->flashend;
+    avr->reset_pc = *config->bootloader ? config->bootloader_start : 0;
+    nano->io.kind = "nano";
+    nano->io.reset = on_reset;
+    selfprog_attach(&nano->selfprog, avr, config->bootloader_start);
+    eeprom_attach(&nano->eeprom, avr);
+    person_init(&nano->person, config);
+    leds_attach(&nano->leds, avr, &nano->adc, &nano->person, nano->map, config, nano->cycles_per_true_second);
+    adc_attach(&nano->adc, avr, &nano->leds, &nano->config.physics, config->seed);
+    timer1_attach(&nano->timer1, avr, &nano->adc);
+    uart_attach(&nano->uart, avr, bridge, config->seed, nano->cycles_per_true_second);
+    markers_attach(&nano->markers, avr);
+    access_take_write(avr, MCUSR, write_mcusr, nano);
+    avr_register_io(avr, &nano->io);  // last, so that access_module() finds it first
+    if (load(nano, error, error_bytes))
+        return -1;
+    power_on(nano);
+    return 0;
+}
+
+void nano_close(struct nano *nano)
+{
+    person_free(&nano->person);
+    sim_map_close(nano->map);
+}
