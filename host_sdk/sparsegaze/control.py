@@ -111,6 +111,14 @@ class VirtualControl:
         now, device_bytes = self.command(f"advance {us} {host_bytes}").split()[:2]
         return float(now), int(device_bytes)
 
+    def barrier(self):
+        """Returns once the simulator has noticed what happened on its port before: openings, changes of speed."""
+        # It looks at the port between two rounds of commands. A connection made after an answer belongs to a later
+        # round than that answer.
+        self.time()
+        with VirtualControl(self.path) as later:
+            later.time()
+
     # the person ---------------------------------------------------------------------------------------------
 
     def target(self, us, azimuth_deg, elevation_deg):

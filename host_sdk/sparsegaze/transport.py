@@ -7,6 +7,7 @@ on the calls made, never on how fast this computer is.
 """
 
 import errno
+import math
 import os
 import time
 
@@ -207,6 +208,7 @@ class LockstepLink(SerialLink):
         self._sent = 0
         self._received = 0
         self._ready = bytearray()
+        control.barrier()
         self._us = control.time().us
         self.reset_s = self.now()
 
@@ -230,8 +232,10 @@ class LockstepLink(SerialLink):
             self._advance(self._us)     # no time passes; empties the pty's buffer
 
     def set_baud(self, baud):
-        self._advance(self._us)
-        super().set_baud(baud)
+        if int(baud) != self.baud:
+            self._advance(self._us)
+            super().set_baud(baud)
+            self.control.barrier()
 
     def flush_input(self):
         self._advance(self._us)
@@ -246,8 +250,7 @@ class LockstepLink(SerialLink):
             self._advance(min(self._us + LOCKSTEP_SLEEP_US, end))
 
     def _advance(self, us):
-        before = self._us
-        self._us, device_bytes = self.control.advance(int(round(us)), self._sent)
+        self._us, device_bytes = self.control.advance(math.ceil(us), self._sent)
         patience = time.monotonic() + LOCKSTEP_PATIENCE_S
         while self._received < device_bytes:
             data = self._read_slice(device_bytes - self._received, READ_SLICES_S[0])
@@ -256,9 +259,6 @@ class LockstepLink(SerialLink):
             if not data and time.monotonic() > patience:
                 raise DisconnectedError(f"{self.port} holds back bytes that the virtual Nano has sent",
                                         "is another program reading from this port?")
-        if us > before and self._us <= before:
-            raise DisconnectedError(f"the virtual Nano behind {self.port} stands still (power is off)",
-                                    "switch its power on again")
 
 
 def _number(error):
