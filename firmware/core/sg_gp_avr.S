@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 ; sg_gp_loop.c for AVR with a multiplier, bit-identical to it. Formats in sg_gp_loop.h.
 ;
-; Every value of sg_gp_loop lives in a register but S2, half of s4, and s5, which are read from *sum once per record.
+; Every value of sg_gp_loop lives in a register but S2, half of s4, and s5: these it reads from *sum once per
+; record.
 
 #if defined(__AVR__) && !defined(SG_GP_PORTABLE)
 
@@ -145,7 +146,8 @@
 5:
 .endm
 
-; void sg_gp_loop(struct sg_gp_sum *sum r25:r24, const uint8_t *record r23:r22, uint8_t n r20, uint8_t space r18)
+; void sg_gp_loop(struct sg_gp_sum *sum r25:r24, const uint8_t *record r23:r22, uint8_t n r20,
+;                 uint8_t space r18)
     .section .text.sg_gp_loop, "ax", @progbits
     .global sg_gp_loop
     .type sg_gp_loop, @function
