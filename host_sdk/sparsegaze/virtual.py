@@ -189,7 +189,8 @@ def _response_map(headset, person, progress):
     from .simulate import response_map
 
     drawn = draw_person(person)
-    return response_map(load_headset(headset), drawn, progress=progress), drawn
+    share = None if progress is None else lambda done: progress("map", done, 1.0)
+    return response_map(load_headset(headset), drawn, progress=share), drawn
 
 
 def _physics(binary, changes):
