@@ -56,6 +56,7 @@ install_packages() {
     fi
     command -v apt-get >/dev/null || die "not a Debian system: install the equivalents of $needed$wanted"
     say "installing Debian packages: $needed$wanted"
+    outcome=done
     # A stale index is no reason to stop: the install below says what it cannot find.
     $sudo apt-get -q update >build/setup/apt.log 2>&1 || true
     # shellcheck disable=SC2086
@@ -89,14 +90,18 @@ fill_venv() {
         "$python" -m venv --clear $venv
     fi
     if [ -f $venv/setup-stamp ] && [ "$(cat $venv/setup-stamp)" = "$(fingerprint)" ]; then
-        return 1
+        return 0
     fi
+    outcome=done
     say "installing the packages of requirements.txt into $venv (1 GB with the AVR compiler; about a minute)"
     $venv/bin/python -m pip install -qq --disable-pip-version-check --no-input --only-binary :all: \
         --require-hashes -r requirements.txt ||
         die "pip could not install requirements.txt: see above"
     $venv/bin/python -m pip install -qq --disable-pip-version-check --no-input --no-index --no-deps \
-        --no-build-isolation -e . || die "the package itself did not build: see above"
+        --no-build-isolation -e . >build/setup/package.log 2>&1 || {
+            grep -m 3 'error' build/setup/package.log >&2
+            die "the package itself did not build (all of it in build/setup/package.log)"
+        }
     fingerprint >$venv/setup-stamp
 }
 
@@ -105,5 +110,7 @@ if command -v flock >/dev/null; then
     exec 9>build/setup/lock
     flock 9
 fi
+outcome="nothing to do"
 install_packages
-if fill_venv; then say done; else say "nothing to do"; fi
+fill_venv
+say "$outcome"
