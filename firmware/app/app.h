@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Between the source files of the application: what the pipeline (main.c), the requests (app_requests.c), the models
-// (app_models.c) and the live state (app_live.c) share.
+// Between the source files of the application: what the pipeline (main.c), the requests (app_requests.c), the
+// models (app_models.c) and the live state (app_live.c) share.
 #ifndef APP_H
 #define APP_H
 
@@ -59,7 +59,7 @@ void app_live_exposures(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t *automat
 const int16_t *app_recentre(void);                          // in force for the model in use
 void app_recentre_set(int16_t az_deg_q7, int16_t el_deg_q7);
 void app_live_keep_exposures(void);                         // store them as they are now
-void app_live_frame(void);                                  // once per frame: notice exposures that moved and stayed
+void app_live_frame(void);                                  // once per frame: notice exposures that moved
 void app_live_step(void);
 
 #endif

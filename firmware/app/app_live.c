@@ -4,9 +4,9 @@
 
 enum {
     RECORD_VERSION = 1,
-    // Exposures are stored when they moved by more than an eighth, looked at every 256 frames (0.92 s): 33 looks
-    // (30 s) after start, then at most every 652 (10 minutes), which 10^5 EEPROM cycles bear for two years of light
-    // that never rests.
+    // Exposures are stored when they moved by more than an eighth, looked at every 256 frames (0.92 s): 33
+    // looks (30 s) after start, then at most every 652 (10 minutes), which 10^5 EEPROM cycles bear for two
+    // years of light that never rests.
     LOOKS_FIRST = 33,
     LOOKS_LATER = 652,
 };
@@ -19,7 +19,8 @@ struct live_record {
     uint8_t exposure_auto;
     uint8_t version;
 };
-_Static_assert(sizeof(struct live_record) == 24 && sizeof(struct live_record) <= HAL_RECORD_MAX, "layout in EEPROM");
+_Static_assert(sizeof(struct live_record) == 24, "layout in EEPROM");
+_Static_assert(sizeof(struct live_record) <= HAL_RECORD_MAX, "fits the port's store");
 
 static struct live_record live;
 static uint8_t dirty;

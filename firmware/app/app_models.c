@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Which model is in use, and the checks of models while frames go on. A check runs in pieces between frames: a CRC
-// over a whole slot would take longer than a frame.
+// Which model is in use, and the checks of models while frames go on. A check runs in pieces between frames:
+// a CRC over a whole slot would take longer than a frame.
 #include "app.h"
 
 #include <stddef.h>
@@ -123,8 +123,8 @@ static int8_t begin(uint8_t type, uint8_t slot, uint16_t seq)
     if (check.at)
         return SG_E_BUSY;
     const int length = sg_model_length(image, slot_room(slot), slot_space(slot));
-    check = (struct check){ .length = length < 0 ? 0 : (uint16_t)length, .at = CRC_FROM, .seq = seq, .type = type,
-                            .slot = slot };
+    check = (struct check){ .at = CRC_FROM, .seq = seq, .type = type, .slot = slot };
+    check.length = length < 0 ? 0 : (uint16_t)length;
     return SG_OK;
 }
 
@@ -182,7 +182,8 @@ void app_models_step(void)
     }
     struct sg_model_view found;
     memset(&found, 0, sizeof found);
-    const int8_t result = (int8_t)sg_model_open_checked(&found, image, slot_room(check.slot), space, check.crc);
+    const uint16_t room = slot_room(check.slot);
+    const int8_t result = (int8_t)sg_model_open_checked(&found, image, room, space, check.crc);
     // Flash cannot have changed since boot; what a verification finds there is only told.
     if (check.slot == SG_SLOT_RAM && active != SG_SLOT_RAM) {
         view[SG_SLOT_RAM] = found;

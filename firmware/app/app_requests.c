@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Requests: one well-formed packet in, one answer out. No length from the line is trusted (PROTOCOL.md P3, P4).
+// Requests: one well-formed packet in, one answer out. No length from the line is trusted (PROTOCOL.md P3,
+// P4).
 #include "app.h"
 
 #include <stddef.h>

@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// The port contract: everything the application asks of a board, and everything a board tells the application.
+// The port contract: everything the application asks of a board, and everything a board tells the
+// application.
 //
-// A port is one directory of firmware/ports with hal_port.h (sizes and markers) and the down-calls below. It owns the
-// chip: timers, ADC, LEDs, serial line, watchdog, non-volatile memory. It never calls anything but the up-calls.
-// All calls are made from the main loop; interrupts stay inside the port. Nothing blocks for longer than 20 us
-// except hal_boot() and hal_load().
+// A port is one directory of firmware/ports with hal_port.h (sizes and markers) and the down-calls below. It
+// owns the chip: timers, ADC, LEDs, serial line, watchdog, non-volatile memory. It never calls anything but
+// the up-calls. All calls are made from the main loop; interrupts stay inside the port. Nothing blocks for
+// longer than 20 us except hal_boot() and hal_load().
 #ifndef HAL_H
 #define HAL_H
 
@@ -24,7 +25,7 @@ struct hal_frame {
     uint16_t exposure_cycles[HAL_CHANNELS];   // release to sample, cycles of hal_describe()'s cpu_hz, exact
 };
 
-// ---------------------------------------------------------------------------------------------------------------
+// ----------------------------------------------------------------------------------------------------
 // Down-calls: the application calls, the port implements.
 
 // Bring the chip up, lights out, interrupts off. First call of all.
@@ -37,8 +38,9 @@ void hal_describe(struct sg_hello *hello);
 // Start sensing, serial line and watchdog, with these exposures (cycles).
 void hal_start(const uint16_t exposure_cycles[HAL_CHANNELS]);
 
-// One turn of the main loop: delivers what has arrived through the up-calls, moves slow writes on, and feeds the
-// watchdog if, and only if, a new sensing frame has come since it last did. Returns 0 when the port has ended.
+// One turn of the main loop: delivers what has arrived through the up-calls, moves slow writes on, and feeds
+// the watchdog if, and only if, a new sensing frame has come since it last did. Returns 0 when the port has
+// ended.
 int hal_poll(void);
 
 // Device time, microseconds since boot; wraps after 2^32.
@@ -47,36 +49,38 @@ uint32_t hal_now_us(void);
 // Exposures from the next slots on, clipped to the port's limits. Whole: no slot sees half of an exposure.
 void hal_expose(const uint16_t exposure_cycles[HAL_CHANNELS]);
 
-// Queue n bytes whole if at least keep_free bytes of the queue stay free after them. Returns 1, or 0 if not queued.
+// Queue n bytes whole if at least keep_free bytes of the queue stay free after them. Returns 1, or 0 if not
+// queued.
 uint8_t hal_send(const uint8_t *bytes, uint8_t n, uint8_t keep_free);
 
-// Once everything queued has left: change the line speed, or reset through the watchdog (slow writes are finished
-// first). Until then hal_send() refuses.
+// Once everything queued has left: change the line speed, or reset through the watchdog (slow writes are
+// finished first). Until then hal_send() refuses.
 enum hal_after { HAL_AFTER_BAUD_1M = 0, HAL_AFTER_BAUD_500K = 1, HAL_AFTER_REBOOT = 2 };
 void hal_after_sending(uint8_t action);
 
-// Where model slot 0 or 1 begins (in the memory space HAL_SLOT_SPACE of sg_model_open), or NULL: no such slot.
+// Where model slot 0 or 1 begins (in the memory space HAL_SLOT_SPACE of sg_model_open), or NULL: no such
+// slot.
 const uint8_t *hal_slot(uint8_t slot);
 
-// Live state, kept through power cycles in two copies. hal_load returns 1 and fills `record` with the newest whole
-// copy of exactly n bytes, or returns 0. hal_save begins a write in the background and returns 1, or 0 while an
-// earlier one is under way. n <= HAL_RECORD_MAX.
+// Live state, kept through power cycles in two copies. hal_load returns 1 and fills `record` with the newest
+// whole copy of exactly n bytes, or returns 0. hal_save begins a write in the background and returns 1, or 0
+// while an earlier one is under way. n <= HAL_RECORD_MAX.
 uint8_t hal_load(void *record, uint8_t n);
 uint8_t hal_save(const void *record, uint8_t n);
 
-// Fill in the port's counters: frames, late_frames (app_on_frame returned after the next frame was complete, or was
-// never called), late_slots, rx_overrun, stack_free, reset_cause, eeprom_writes.
+// Fill in the port's counters: frames, late_frames (app_on_frame returned after the next frame was complete,
+// or was never called), late_slots, rx_overrun, stack_free, reset_cause, eeprom_writes.
 void hal_report(struct sg_status *status);
 
-// ---------------------------------------------------------------------------------------------------------------
+// ----------------------------------------------------------------------------------------------------
 // Up-calls: the port calls, the application implements.
 
 // A sensing frame is complete. Called at most once per hal_poll(), with the newest.
 void app_on_frame(const struct hal_frame *frame);
 
 // One byte arrived; zero_us is when the latest 0x00 arrived. Called only while one whole reply
-// (SG_WIRE_FRAME_MAX) fits into the send queue: what is not delivered waits, so a request is never dropped for
-// want of room for its answer.
+// (SG_WIRE_FRAME_MAX) fits into the send queue: what is not delivered waits, so a request is never dropped
+// for want of room for its answer.
 void app_on_byte(uint8_t byte, uint32_t zero_us);
 
 #endif

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The application: one frame's way from ADC codes to bytes on the line. It knows the core and hal.h and nothing of the
-// chip.
+// The application: one frame's way from ADC codes to bytes on the line. It knows the core and hal.h and
+// nothing of the chip.
 #include "app.h"
 
 enum {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// An application that hangs on purpose, on the real port: the watchdog's test. HANG_LIT: with interrupts off, at a moment
-// when emitters are lit. Otherwise: the main loop stops while the sensing engine runs on.
+// An application that hangs on purpose, on the real port: the watchdog's test. HANG_LIT: with interrupts off,
+// at a moment when emitters are lit. Otherwise: the main loop stops while the sensing engine runs on.
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <string.h>

@@ -20,7 +20,8 @@ static uint8_t cause;
 
 extern uint8_t __heap_start;    // first byte after all static data
 
-// Before anything else uses registers or stack. A watchdog reset leaves the watchdog running at 16 ms: off at once.
+// Before anything else uses registers or stack. A watchdog reset leaves the watchdog running at 16 ms: off at
+// once.
 void boot_first(void) __attribute__((naked, used, section(".init3")));
 void boot_first(void)
 {
@@ -35,9 +36,9 @@ void boot_first(void)
         *p = PAINT;
 }
 
-// MCUSR says it when the bootloader left it alone. Optiboot before 4.6 clears it: then a UART that is switched on means
-// that the bootloader held a session (it does so only after an external reset), a lost signature means that
-// power was off, and what remains is the watchdog.
+// MCUSR says it when the bootloader left it alone. Optiboot before 4.6 clears it: then a UART that is
+// switched on means that the bootloader held a session (it does so only after an external reset), a lost
+// signature means that power was off, and what remains is the watchdog.
 static uint8_t find_cause(void)
 {
     const uint8_t known = SG_RESET_POWER | SG_RESET_EXTERNAL | SG_RESET_BROWNOUT | SG_RESET_WATCHDOG;

@@ -6,13 +6,13 @@
 #include <avr/io.h>
 
 enum {
-    HAL_TRIAL_BYTES = 880,      // 256 + 48 * 13: a trial model of 48 vectors, beside >= 300 B of stack in 2 KiB
+    HAL_TRIAL_BYTES = 880,      // 256 + 48 * 13: 48 vectors, beside >= 300 B of stack in 2 KiB
     HAL_SLOT_SPACE = 1,         // SG_ROM_FLASH: slots are read through LPM
     HAL_RECORD_MAX = 32,        // live state
 };
 
-// Sections for exact cycle counts (tests/budget.csv): GPIOR0 = 2k+1 begins, 2k+2 ends section k. Two cycles each, on
-// silicon as in the virtual Nano, so the shipped binary is the measured one.
+// Sections for exact cycle counts (tests/budget.csv): GPIOR0 = 2k+1 begins, 2k+2 ends section k. Two cycles
+// each, on silicon as in the virtual Nano, so the shipped binary is the measured one.
 enum hal_section {
     HAL_SECTION_INFER = 0,      // sg_track_infer
     HAL_SECTION_FEATURE = 1,    // codes and exposures to features

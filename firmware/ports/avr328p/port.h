@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Between the source files of this port. One noun each: boot, sense, serial, store, and poll, which joins them.
+// Between the source files of this port. One noun each: boot, sense, serial, store, and poll, which joins
+// them.
 #ifndef PORT_H
 #define PORT_H
 
@@ -14,8 +15,8 @@ enum port_limits {
     CYCLES_PER_US = 16,
     SLOT_CYCLES = 600 * CYCLES_PER_US,
     EXPOSURE_MIN_CYCLES = 24 * CYCLES_PER_US,
-    // The eye-safety cap. Lit are 5 us of settling, the exposure and the few us until the interrupt after the sample:
-    // below 300 of every 600 us. No command and no caller gets past hal_expose().
+    // The eye-safety cap. Lit are 5 us of settling, the exposure and the few us until the interrupt after the
+    // sample: below 300 of every 600 us. No command and no caller gets past hal_expose().
     EXPOSURE_MAX_CYCLES = 280 * CYCLES_PER_US,
     SLOT_A = 0x6000,
     SLOT_B = 0x6C00,
@@ -36,7 +37,7 @@ void sense_report(struct sg_status *status);
 // serial.c
 void serial_start(void);
 uint8_t serial_room(void);              // bytes free in the send queue
-uint8_t serial_poll(void);              // delivers received bytes; carries out what waits for the line to drain
+uint8_t serial_poll(void);              // delivers received bytes; acts once the line has drained
 uint16_t serial_overruns(void);
 
 // store.c

@@ -1,11 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 // The sensing engine: LED i senses while the other five emit, six slots of 600 us a frame, all in interrupts.
 //
-//   slot + 0      OCR1A    the other five light; ~5 us later the charged cathode is released, the release instant is
+//   slot + 0      OCR1A    the other five light; ~5 us later the charged cathode is released, the release
+//   instant is
 //                          read from TCNT1, and OCR1B is set to release + exposure
-//   + exposure    OCR1B    hardware starts the ADC; sample-and-hold closes 260 cycles later. No code is involved
-//   + 8 cycles    OCR1A    lights out; the next LED's cathode is driven high
-//   + 92 us       ADC      code read; a throw-away conversion of the next channel charges the sample capacitor
+//   + exposure    OCR1B    hardware starts the ADC; sample-and-hold closes 260 cycles later. No code is
+//   involved + 8 cycles    OCR1A    lights out; the next LED's cathode is driven high
+//   + 92 us       ADC      code read; a throw-away conversion of the next channel charges the sample
+//   capacitor
 //                          to Vcc through that cathode
 // An interrupt that comes late moves the release and, with it, the sample: never the exposure.
 #include "port.h"
@@ -15,8 +17,8 @@ enum {
     PORTD_DARK = 1 << PD0,          // pull-up on the UART's input
     DDRD_ALL = 0xFC,
     DDRC_ALL = 0x3F,
-    // TCNT1 = OCR1B to the closing of sample-and-hold: the flag rises one cycle after the match, three cycles go into
-    // synchronisation (datasheet, ADC auto triggering), then two ADC clocks of 128 cycles.
+    // TCNT1 = OCR1B to the closing of sample-and-hold: the flag rises one cycle after the match, three cycles
+    // go into synchronisation (datasheet, ADC auto triggering), then two ADC clocks of 128 cycles.
     SAMPLE_CYCLES = 1 + 3 + 2 * 128,
     // Release (the OUT to PORTC) to the TCNT1 value that the LDS after it returns.
     RELEASE_READ_CYCLES = 1,
@@ -31,7 +33,7 @@ enum {
     ADMUX_AVCC = 1 << REFS0,
 };
 _Static_assert(EXPOSURE_MIN_CYCLES > EXPOSURE_FIXED_CYCLES + SOON_CYCLES, "the trigger must lie ahead");
-_Static_assert(5 * CYCLES_PER_US + EXPOSURE_MAX_CYCLES + 6 * CYCLES_PER_US < SLOT_CYCLES / 2, "lit at most half");
+_Static_assert((5 + 6) * CYCLES_PER_US + EXPOSURE_MAX_CYCLES < SLOT_CYCLES / 2, "lit at most half of a frame");
 
 struct slot {
     uint16_t release;               // TCNT1
@@ -234,7 +236,8 @@ uint8_t sense_take(struct hal_frame *frame)
         sum_half_cycles += frame->exposure_cycles[i] >> 1;
     last += frame->exposure_cycles[HAL_CHANNELS - 1];
     sum_cycles += sum_half_cycles;
-    // sum / 6, as (sum / 2) * 21846 / 2^16: at most two cycles too much for frames below 3600 us, and 32 bits hold it.
+    // sum / 6, as (sum / 2) * 21846 / 2^16: at most two cycles too much for frames below 3600 us, and 32 bits
+    // hold it.
     const uint16_t mean = (uint16_t)(((sum_cycles >> 1) * 21846UL) >> 16);
     const uint32_t first_us = (start_overflows << 12) | (first >> 4);
     frame->t_us = first_us + ((mean + (first & 15U) + 8U) >> 4);

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// UART0 with a ring each way. At 1 Mbaud a byte takes 160 cycles and the receiver bridges two: the interrupts are short.
+// UART0 with a ring each way. At 1 Mbaud a byte takes 160 cycles and the receiver bridges two: the interrupts
+// are short.
 #include "port.h"
 
 enum {

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Live state in EEPROM: two copies, each  payload | sequence | CRC-16. A write goes to the older copy, one byte per
-// 3.4 ms, started and left; if power fails in the middle its CRC does not fit and the other copy is still whole.
+// Live state in EEPROM: two copies, each  payload | sequence | CRC-16. A write goes to the older copy, one
+// byte per 3.4 ms, started and left; if power fails in the middle its CRC does not fit and the other copy is
+// still whole.
 #include "port.h"
 
 #include <avr/eeprom.h>

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// A port that has no hardware: it builds with any C11 compiler, senses nothing, says nothing and ends at once. What each
-// function owes is in hal.h; this is the shape to fill in.
+// A port that has no hardware: it builds with any C11 compiler, senses nothing, says nothing and ends at
+// once. What each function owes is in hal.h; this is the shape to fill in.
 #include "hal.h"
 
 #include <stddef.h>

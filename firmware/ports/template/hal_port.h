@@ -5,7 +5,7 @@
 
 enum {
     HAL_TRIAL_BYTES = 880,      // RAM for a trial model, bytes
-    HAL_SLOT_SPACE = 0,         // memory space of hal_slot()'s images: 0 ordinary, 1 flash that needs its own load
+    HAL_SLOT_SPACE = 0,         // memory of hal_slot()'s images: 0 ordinary, 1 flash with its own load
     HAL_RECORD_MAX = 32,        // largest record hal_save() must take, bytes
 };
 
