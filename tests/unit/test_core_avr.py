@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The core on a simulated ATmega328P: the same bits as on the host, and what they cost."""
+import re
+import shutil
+import zlib
+
+import numpy as np
+import pytest
+
+import core_avr_harness as avr
+from core_models import Parts, View, features_near, random_parts
+from sparsegaze._core import ffi, lib
+from test_core_gp import GOLDEN_CRC, golden_case
+
+pytestmark = pytest.mark.skipif(not avr.avr_tool("avr-gcc") or not shutil.which("gcc"), reason="no avr-gcc")
+TWINS = {"assembly": (), "portable": ("SG_GP_PORTABLE",)}
+
+# Net cycles at 64 vectors, 6 channels, 4 guards, all kernels in range. A change of either sign is worth a look: then
+# change the number.
+CYCLES = {("assembly", "infer_flash"): 15611, ("portable", "infer_flash"): 39640, ("assembly", "features"): 2584}
+TOLERANCE = 0.03
+
+READINGS = [([200 + 40 * i, 33, 1016, 700, 500, 1023 - i], [128 + 300 * i, 4480, 777, 4480, 1024, 300])
+            for i in range(14)] + [([0, 32, 33, 1016, 1017, 1023], [128, 129, 1000, 4480, 4479, 65535])]
+
+
+@pytest.fixture(scope="session")
+def bench_dir(tmp_path_factory):
+    """Where the simulator's runner is built once."""
+    directory = tmp_path_factory.mktemp("core_avr")
+    avr.runner(directory)
+    return directory
+
+
+def gaze_bytes(parts, feature):
+    """What the host's core makes of the features: n structs of 12 bytes."""
+    view, out = View(parts.image()), ffi.new("struct sg_gaze[]", len(feature))
+    assert view.verdict == lib.SG_OK
+    lib.sg_batch_infer(view.view, ffi.from_buffer("uint16_t[]", np.ascontiguousarray(feature)), ffi.NULL,
+                       ffi.new("int16_t[2]"), out, len(feature))
+    return bytes(ffi.buffer(out))
+
+
+def exposure_bytes():
+    """Flags, features and stepped exposures of READINGS on the host, as bench.c writes them."""
+    led = [ffi.new("struct sg_expose_led *") for _ in range(6)]
+    for one in led:
+        lib.sg_expose_start(one, lib.SG_EXPOSE_START_CYCLES)
+    out = b""
+    for code, cycles in READINGS:
+        feature = ffi.new("uint16_t[6]")
+        out += bytes([lib.sg_track_features(code, cycles, feature)]) + bytes(ffi.buffer(feature))
+        for j in range(6):
+            lib.sg_expose_step(led[j], code[j], cycles[j])
+            out += led[j].exposure_cycles.to_bytes(2, "little")
+    return out
+
+
+def run(bench_dir, parts, feature, twin):
+    codes, exposures = zip(*READINGS)
+    return avr.run_bench(bench_dir, parts.image(), feature, codes, exposures, TWINS[twin])
+
+
+def check_bytes(result, parts, feature):
+    """Compare every byte the bench wrote; returns the gaze bytes."""
+    gaze, out = gaze_bytes(parts, feature), result.output
+    trial = len(parts.image()) <= 256 + 48 * 13
+    expected = b"\0" + gaze + (b"\0" + gaze if trial else b"") + exposure_bytes()
+    assert out[:len(expected)] == expected
+    frame, decoded = out[len(expected):-2], out[-2:]
+    head, made = ffi.new("struct sg_head *", [0x0100, lib.SG_MSG_GAZE, 0]), ffi.new("uint8_t[72]")
+    n = lib.sg_wire_encode(head, gaze[-12:], 12, made)
+    assert frame == bytes(ffi.buffer(made, n)) and int.from_bytes(decoded, "little") == 12
+    return out[1:1 + len(gaze)]
+
+
+@pytest.mark.parametrize("twin", TWINS)
+def test_golden_vectors_are_bit_identical(bench_dir, twin):
+    parts, feature = golden_case()
+    crc = zlib.crc32(check_bytes(run(bench_dir, parts, feature, twin), parts, feature))
+    print(f"golden CRC-32 over 64 predictions, ATmega328P, {twin}: {crc:08x}")
+    assert crc == GOLDEN_CRC
+
+
+@pytest.mark.parametrize("twin", TWINS)
+@pytest.mark.parametrize("d,n", [(1, 1), (3, 48), (5, 7), (6, 48), (6, 200)])
+def test_random_models_from_flash_and_memory_are_bit_identical(bench_dir, twin, d, n):
+    rng = np.random.default_rng(10 * d + n)
+    parts = random_parts(rng, n, d, guards=n % 9)
+    feature = np.concatenate([features_near(rng, parts, 30), rng.integers(0, 65536, (20, 6)).astype(np.uint16)])
+    check_bytes(run(bench_dir, parts, feature, twin), parts, feature)
+
+
+@pytest.mark.parametrize("twin", TWINS)
+def test_extremes_of_the_distance_and_of_every_operand_are_bit_identical(bench_dir, twin):
+    # T at both ends of 24 bits, at 0, around 2^20 and around every carry; weights and trends at their limits.
+    half_c2 = [0, 1, 255, 256, 65535, 65536, 2 ** 20 - 1, 2 ** 20, 2 ** 20 + 1, 2 ** 22 - 1, 3121200]
+    rows, halves, weights = [], [], []
+    for i, half in enumerate(half_c2):
+        for c in (0, 1, 128, 255):
+            rows.append([c] * 6)
+            halves.append(half)
+            weights.append([(-32768, 32767, -1, 1, 255, -256)[(i + c) % 6], (32767, -32768, 0, 256)[i % 4]])
+    parts = Parts(offset=np.zeros(6, int), gain_q12=np.full(6, 4096), bias=np.array([2 ** 31 - 1, -2 ** 31]),
+                  trend=np.array([[2 ** 31 - 1, -2 ** 31, -1, 1, 65535, -65536]] * 2), centre=np.array(rows),
+                  weight=np.array(weights), weight_frac_bits=6, half_c2=np.array(halves),
+                  guard=[(-2 ** 31, 2 ** 31 - 1, np.array([-128, 127, -1, 1, 0, -128])),
+                         (-3 * 10 ** 6, 10 ** 6, np.full(6, -128))])
+    s = (0, 1, 15, 16, 255, 256, 4094, 4095)
+    feature = [[v] * 6 for v in s] + [[a, b, a, b, a, b] for a in s for b in s if a != b]
+    check_bytes(run(bench_dir, parts, np.array(feature, np.uint16), twin), parts, np.array(feature, np.uint16))
+
+
+@pytest.mark.parametrize("twin", TWINS)
+def test_cycles_at_64_vectors(bench_dir, twin):
+    rng = np.random.default_rng(2)
+    parts = Parts(offset=np.full(6, 20000), gain_q12=np.full(6, 1500), bias=rng.integers(-2 ** 27, 2 ** 27, 2),
+                  trend=rng.integers(-9000, 9000, (2, 6)), centre=rng.integers(98, 103, (64, 6)),
+                  weight=rng.integers(-32768, 32768, (64, 2)),
+                  guard=[(-2 ** 30, 2 ** 30, rng.integers(-128, 128, 6)) for _ in range(4)])
+    feature = (20000 + 1600 * 4096 // 1500 + rng.integers(0, 40, (20, 6))).astype(np.uint16)
+    cycles = run(bench_dir, parts, feature, twin).cycles
+    print(twin, cycles)
+    assert cycles["empty"] == (1, 0, 0)
+    for (which, section), expected in CYCLES.items():
+        if which == twin:
+            assert cycles[section][2] == pytest.approx(expected, rel=TOLERANCE), section
+    assert cycles["infer_flash"][2] <= {"assembly": 16000, "portable": 40000}[twin]
+
+
+def test_no_float_no_division_no_heap_is_linked(bench_dir):
+    parts, feature = golden_case()
+    run(bench_dir, parts, feature, "portable")
+    symbols = avr.run([avr.avr_tool("avr-nm"), bench_dir / "bench.elf"])
+    names = {line.split()[-1] for line in symbols.splitlines()}
+    bad = {n for n in names if re.search(r"div|mod[qhs]i|(sf|df)[0-9]?$|malloc|free|printf|memcpy$", n)}
+    assert "sg_gp_predict" in names and not bad
+    assert not any(line.split()[-2] in "bBdD" for line in symbols.splitlines() if line.split()[-1].startswith("sg_"))

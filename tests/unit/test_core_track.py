@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""sg_track: the frame that leaves the pipeline, and when it may be called valid."""
+import itertools
+
+import numpy as np
+import pytest
+
+from core_models import Parts, View, features_near, random_parts, scaled, twin
+from sparsegaze._core import ffi, lib
+
+RAW_FLAGS = (lib.SG_FLAG_SATURATED, lib.SG_FLAG_STARVED, lib.SG_FLAG_EXPOSURE, lib.SG_FLAG_TRIAL)
+
+
+def plain(bias_deg_q7=(0, 0)):
+    """One vector of weight 0: the gaze is the bias."""
+    return Parts(offset=np.full(6, 100), gain_q12=np.full(6, 4096), bias=np.array(bias_deg_q7) << 15,
+                 trend=np.zeros((2, 6), int), centre=np.zeros((1, 6), int), weight=np.zeros((1, 2), int),
+                 weight_frac_bits=6)
+
+
+def infer(view, feature, raw_flags=0, recentre=(0, 0)):
+    out = ffi.new("struct sg_gaze *")
+    ffi.memmove(out, b"\xAA" * 12, 12)
+    result = lib.sg_track_infer(view, [int(x) for x in feature], raw_flags, list(recentre), out)
+    assert out.t_us == out.infer_us == out.reserved == 0        # nothing of the old frame is left
+    return result, (out.azimuth_deg_q7, out.elevation_deg_q7), out.flags
+
+
+def test_no_model_is_zero_with_its_flag_and_never_valid():
+    for raw in range(256):
+        result, gaze, flags = infer(ffi.NULL, [65535] * 6, raw, (30000, -30000))
+        assert (result, gaze) == (lib.SG_OK, (0, 0))
+        assert flags == lib.SG_FLAG_NO_MODEL | (raw & sum(RAW_FLAGS))
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_valid_for_exactly_the_right_flags(inside):
+    view = View(plain((128, -256)).image())
+    feature = [200] * 6 if inside else [99] + [200] * 5
+    for chosen in itertools.product((0, 1), repeat=4):
+        raw = sum(flag for flag, on in zip(RAW_FLAGS, chosen) if on)
+        result, gaze, flags = infer(view.view, feature, raw | lib.SG_FLAG_VALID | lib.SG_FLAG_NO_MODEL)
+        good = inside and not raw & (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED)
+        expected = raw | (lib.SG_FLAG_VALID if good else 0) | (0 if inside else lib.SG_FLAG_OUT_OF_RANGE)
+        assert (result, gaze, flags) == (lib.SG_OK, (128, -256), expected)
+
+
+@pytest.mark.parametrize("bias,recentre,sums,saturates", [
+    ((1000, -1000), (24, 26), (1024, -974), False), ((32000, 0), (767, 0), (32767, 0), False),
+    ((32000, 0), (768, 5), (32767, 5), True), ((0, -32000), (0, -768), (0, -32768), False),
+    ((0, -32000), (3, -769), (3, -32768), True), ((32767, -32768), (32767, -32768), (32767, -32768), True)])
+def test_recentre_adds_and_saturates_without_wrapping(bias, recentre, sums, saturates):
+    result, gaze, flags = infer(View(plain(bias).image()).view, [200] * 6, 0, recentre)
+    assert gaze == sums and result == (lib.SG_E_RANGE if saturates else lib.SG_OK)
+    assert flags == (lib.SG_FLAG_OUT_OF_RANGE if saturates else lib.SG_FLAG_VALID)
+
+
+def test_batch_equals_single_frames_and_the_twin():
+    rng = np.random.default_rng(5)
+    parts = random_parts(rng, 40, guards=1)
+    feature = features_near(rng, parts, 200)
+    raw = rng.choice([0, 8, 16, 32, 64], 200).astype(np.uint8)
+    view, out = View(parts.image()), ffi.new("struct sg_gaze[200]")
+    recentre = ffi.new("int16_t[2]", [100, -50])
+    lib.sg_batch_infer(view.view, ffi.from_buffer("uint16_t[]", feature), ffi.from_buffer("uint8_t[]", raw),
+                       recentre, out, 200)
+    deg, outside = twin(parts, feature)
+    assert not scaled(parts, feature)[1].all()
+    for i in range(200):
+        single = infer(view.view, feature[i], int(raw[i]), (100, -50))
+        assert single[1:] == ((out[i].azimuth_deg_q7, out[i].elevation_deg_q7), out[i].flags)
+        expected = np.clip(np.clip(deg[i], -32768, 32767) + [100, -50], -32768, 32767)
+        assert list(single[1]) == list(expected)
+        assert bool(single[2] & lib.SG_FLAG_VALID) == (
+            not outside[i] and not raw[i] & 24 and single[0] == lib.SG_OK)
+
+
+def test_features_of_a_frame_are_those_of_its_channels_with_flags_joined():
+    code, cycles = [500, 32, 1020, 700, 33, 1016], [128, 4480, 1000, 4480, 300, 2000]
+    out, one = ffi.new("uint16_t[6]"), ffi.new("uint16_t *")
+    flags = lib.sg_track_features(code, cycles, out)
+    joined = 0
+    for i in range(6):
+        joined |= lib.sg_expose_feature(code[i], cycles[i], one)
+        assert one[0] == out[i]
+    assert flags == joined == lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED
+    assert lib.sg_track_features([500] * 6, cycles, out) == 0
