@@ -5,13 +5,15 @@
 #include <stdio.h>
 #include <string.h>
 
+#include <simavr/avr_extint.h>
+
 #include "../../sim_c/sim_map.h"
 #include "access.h"
 #include "hexfile.h"
 #include "images.h"
 #include "noise.h"
 
-enum { MCUSR = 0x54, SRAM = 0x100, SRAM_END = 0x900, BATCH_CYCLES = 16000 };
+enum { ACSR = 0x50, MCUSR = 0x54, SRAM = 0x100, SRAM_END = 0x900, BATCH_CYCLES = 16000 };
 static const char FLASH_IMAGE[] = "flash.bin", EEPROM_IMAGE[] = "eeprom.bin";
 
 // Of libsimavr; exported but not declared in an installed header.
@@ -19,14 +21,16 @@ avr_flashaddr_t avr_run_one(avr_t *avr);
 
 // One batch of instructions, up to the next timer or interrupt. Replaces libsimavr's loop, which sleeps in real time
 // and overshoots a sleep by a cycle.
-static void run_batch(avr_t *avr)
+static void run_batch(struct nano *nano)
 {
-    struct nano *nano = (struct nano *)access_module(avr, "nano");
+    avr_t *avr = nano->avr;
     avr_flashaddr_t pc = avr->pc;
     if (avr->state == cpu_Running)
         pc = avr_run_one(avr);
     avr_cycle_count_t idle = avr_cycle_timer_process(avr);
     avr->pc = pc;
+    if (nano->watchdog.expired)
+        return;
     if (avr->state == cpu_Sleeping) {
         nano->markers.slept = true;
         avr->cycle += idle;
@@ -53,29 +57,27 @@ static avr_cycle_count_t stop_here(avr_t *avr, avr_cycle_count_t when, void *par
     return 0;
 }
 
-static void on_reset(avr_io_t *io)
-{
-    ((struct nano *)io)->reset_seen = true;
-}
-
 // What avr_reset() leaves undone or undoes.
 static void after_reset(struct nano *nano, enum nano_reset cause)
 {
     avr_t *avr = nano->avr;
-    nano->reset_seen = false;
     nano->resets++;
     if (cause == NANO_RESET_WATCHDOG)
         nano->watchdog_resets++;
     nano->reset_flags = cause == NANO_RESET_POWER ? NANO_RESET_POWER : nano->reset_flags | (uint8_t)cause;
     avr->data[MCUSR] = nano->reset_flags;
-    avr->run = run_batch;
     avr->run_cycle_limit = BATCH_CYCLES;
+    // INT0 and INT1 are on two anodes. Left alone, the stock module looks at such a pin every cycle while it is low,
+    // once more for every time it became low.
+    avr_extint_set_strict_lvl_trig(avr, 0, 0);
+    avr_extint_set_strict_lvl_trig(avr, 1, 0);
     timer1_reset(&nano->timer1);
     adc_reset(&nano->adc);
     eeprom_reset(&nano->eeprom);
     selfprog_reset(&nano->selfprog);
     leds_reset(&nano->leds, cause == NANO_RESET_POWER);
     markers_reset(&nano->markers);
+    watchdog_reset(&nano->watchdog, nano->reset_flags & NANO_RESET_WATCHDOG);
     uart_reset(&nano->uart);
 }
 
@@ -152,12 +154,26 @@ void nano_run_until(struct nano *nano, uint64_t cycle)
         }
         uint64_t limit = cycle < nano->cut_cycle ? cycle : nano->cut_cycle;
         access_at(avr, limit, stop_here, nano);
-        while (avr->cycle < limit && !nano->reset_seen)
-            avr->run(avr);
+        while (avr->cycle < limit && !nano->watchdog.expired)
+            run_batch(nano);
         avr_cycle_timer_cancel(avr, stop_here, nano);
-        if (nano->reset_seen)
+        if (nano->watchdog.expired) {
+            avr_reset(avr);
             after_reset(nano, NANO_RESET_WATCHDOG);
+        }
     }
+}
+
+// libsimavr's comparator looks at its pins after every access to an ADC register, which is slow, and knows no
+// voltages. It goes, with the register watchers it has set up (nobody else has any). ACSR is plain memory.
+static void take_comparator_out(avr_t *avr)
+{
+    access_module(avr, "ac")->reset = NULL;
+    avr_cycle_timer_reset(avr);
+    for (int i = 0; i < MAX_IOs; i++)
+        avr->io[i].irq = NULL;
+    access_take_write(avr, ACSR, NULL, NULL);
+    access_take_read(avr, ACSR, NULL, NULL);
 }
 
 static void silent(avr_t *avr, const int level, const char *format, va_list list)
@@ -215,8 +231,8 @@ int nano_open(struct nano *nano, const struct config *config, struct bridge *bri
     avr->frequency = 16000000;
     avr->codeend = avr->flashend;
     avr->reset_pc = *config->bootloader ? config->bootloader_start : 0;
-    nano->io.kind = "nano";
-    nano->io.reset = on_reset;
+    take_comparator_out(avr);
+    watchdog_attach(&nano->watchdog, avr);
     selfprog_attach(&nano->selfprog, avr, config->bootloader_start);
     eeprom_attach(&nano->eeprom, avr);
     person_init(&nano->person, config);
@@ -226,7 +242,6 @@ int nano_open(struct nano *nano, const struct config *config, struct bridge *bri
     uart_attach(&nano->uart, avr, bridge, config->seed, nano->cycles_per_true_second);
     markers_attach(&nano->markers, avr);
     access_take_write(avr, MCUSR, write_mcusr, nano);
-    avr_register_io(avr, &nano->io);  // last, so that access_module() finds it first
     if (load(nano, error, error_bytes))
         return -1;
     power_on(nano);

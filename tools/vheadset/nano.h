@@ -18,11 +18,11 @@
 #include "selfprog.h"
 #include "timer1.h"
 #include "uart.h"
+#include "watchdog.h"
 
 enum nano_reset { NANO_RESET_POWER = 1, NANO_RESET_EXTERNAL = 2, NANO_RESET_BROWNOUT = 4, NANO_RESET_WATCHDOG = 8 };
 
 struct nano {
-    avr_io_t io;                 // first: its reset callback tells of resets by the watchdog
     avr_t *avr;
     struct config config;
     struct bridge *bridge;
@@ -32,11 +32,12 @@ struct nano {
     struct uart uart;
     struct eeprom eeprom;
     struct selfprog selfprog;
+    struct watchdog watchdog;
     struct leds leds;
     struct person person;
     struct markers markers;
     double cycles_per_true_second;
-    bool powered, reset_seen;
+    bool powered;
     uint8_t reset_flags;         // MCUSR, which a reset keeps
     uint64_t cut_cycle;          // power fails there; UINT64_MAX = not planned
     uint64_t resets, watchdog_resets, power_ons, crashes;
