@@ -42,7 +42,7 @@ firmware: setup ## build the Nano's firmware, check its link, put the hex into t
 	@$(call refresh,$(PIO)/firmware.hex,$(HEX),echo "$(HEX) changed: commit it together with the sources")
 
 native: setup build/native/core build/native/sim ## build what runs here: core, simulator, virtual Nano
-	@$(MAKE) --no-print-directory -C tools/vheadset
+	@$(MAKE) -s --no-print-directory -C tools/vheadset
 
 # setup has built the core too, under setuptools' name for it: only one may stay, the other gets stale.
 build/native/core: $(wildcard firmware/core/*.[ch] $(SDK)/_core_b*.[pc]*) .venv/setup-stamp
