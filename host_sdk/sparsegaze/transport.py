@@ -28,7 +28,8 @@ except ImportError:
 WRITE_TIMEOUT_S = 5.0
 RESET_PULSE_S = 0.1             # DTR/RTS released: long enough to recharge the Nano's 100 nF
 READ_SLICES_S = (0.2, 0.02, 0.002)
-LOCKSTEP_SLICE_US = 1000        # while waiting for bytes
+LOCKSTEP_SLICE_US = 1000        # while waiting for an answer
+LOCKSTEP_LISTEN_US = 32000      # while only listening: 400 bytes of stream
 LOCKSTEP_SLEEP_US = 20000       # 2000 bytes at 1 Mbaud: a pty holds 4095
 LOCKSTEP_WRITE_BYTES = 1024
 LOCKSTEP_PATIENCE_S = 10.0      # real seconds in which sent bytes must show up
@@ -208,6 +209,7 @@ class LockstepLink(SerialLink):
         self._sent = 0
         self._received = 0
         self._ready = bytearray()
+        self._slice_us = LOCKSTEP_SLICE_US
         control.barrier()
         self._us = control.time().us
         self.reset_s = self.now()
@@ -219,7 +221,9 @@ class LockstepLink(SerialLink):
     def read(self, n, timeout_s):
         deadline = self._us + timeout_s * 1e6
         while not self._ready and self._us < deadline:
-            self._advance(min(self._us + LOCKSTEP_SLICE_US, deadline))
+            self._advance(min(self._us + self._slice_us, deadline))
+            # Whoever only listens needs no quick answer: longer slices cost fewer round trips.
+            self._slice_us = min(2 * self._slice_us, LOCKSTEP_LISTEN_US)
         data = bytes(self._ready[:n])
         del self._ready[:n]
         return data
@@ -229,6 +233,7 @@ class LockstepLink(SerialLink):
             part = data[start:start + LOCKSTEP_WRITE_BYTES]
             super().write(part)
             self._sent += len(part)
+            self._slice_us = LOCKSTEP_SLICE_US
             self._advance(self._us)     # no time passes; empties the pty's buffer
 
     def set_baud(self, baud):
