@@ -81,10 +81,11 @@ static void count_readings(const struct hal_frame *frame)
 
 static void stream(const struct hal_frame *frame, const struct sg_raw *raw, const struct sg_gaze *gaze)
 {
-    if (app.stream & SG_STREAM_RAW)
-        send_stream(SG_MSG_RAW, frame->seq, raw, sizeof *raw);
+    // The gaze goes first: it is the one that somebody waits for.
     if (app.stream & SG_STREAM_GAZE)
         send_stream(SG_MSG_GAZE, frame->seq, gaze, sizeof *gaze);
+    if (app.stream & SG_STREAM_RAW)
+        send_stream(SG_MSG_RAW, frame->seq, raw, sizeof *raw);
     if (app.stream & SG_STREAM_COUNTS) {
         struct sg_counts counts = { .t_us = frame->t_us };
         for (uint8_t i = 0; i < HAL_CHANNELS; i++) {

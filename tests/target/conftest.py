@@ -6,6 +6,7 @@ import subprocess
 import numpy as np
 import pytest
 
+from sparsegaze import wire
 from sparsegaze.device import Device
 from sparsegaze.mapfile import synthetic_map
 from sparsegaze.model import CHANNELS, SLOT_BYTES, DeviceModel
@@ -97,6 +98,16 @@ def port_with(repo_root, avr_tools, tmp_path_factory):
         return out
 
     return build
+
+
+def exchange(device, data, wait_s=0.05):
+    """Send bytes, return the packets that come back within wait_s of virtual time."""
+    device.link.write(data)
+    decoder, packets, end = wire.Decoder(), [], device.link.now() + wait_s
+    while device.link.now() < end:
+        packets += decoder.feed(device.link.read(4096, end - device.link.now()))
+    assert decoder.bad == 0
+    return packets
 
 
 def collect(device, n, timeout_s=2.0):

@@ -14,8 +14,9 @@ enum {
 
 static uint32_t alive __attribute__((section(".noinit")));
 static uint8_t left_mcusr __attribute__((section(".noinit")));
-static uint8_t left_r2 __attribute__((section(".noinit")));
-static uint8_t left_uart __attribute__((section(".noinit")));
+static struct {                         // registers as they were found; a reset leaves them alone
+    uint8_t r2, r10, r11, r14, r15;
+} left __attribute__((section(".noinit")));
 static uint8_t cause;
 
 extern uint8_t __heap_start;    // first byte after all static data
@@ -25,9 +26,12 @@ extern uint8_t __heap_start;    // first byte after all static data
 void boot_first(void) __attribute__((naked, used, section(".init3")));
 void boot_first(void)
 {
-    __asm__ volatile("sts %0, r2" : : "i"(&left_r2));
+    __asm__ volatile("sts %0, r2" "\n\t"
+                     "sts %0+1, r10" "\n\t"
+                     "sts %0+2, r11" "\n\t"
+                     "sts %0+3, r14" "\n\t"
+                     "sts %0+4, r15" : : "i"(&left));
     left_mcusr = MCUSR;
-    left_uart = UCSR0B;
     MCUSR = 0;
     __asm__ volatile("wdr");
     WDTCSR = (1 << WDCE) | (1 << WDE);
@@ -36,18 +40,25 @@ void boot_first(void)
         *p = PAINT;
 }
 
-// MCUSR says it when the bootloader left it alone. Optiboot before 4.6 clears it: then a UART that is
-// switched on means that the bootloader held a session (it does so only after an external reset), a lost
-// signature means that power was off, and what remains is the watchdog.
+// Optiboot 4 keeps these constants in registers from the moment it begins to listen, which it does after an
+// external reset only. It leaves through its watchdog; a watchdog reset while the application runs finds the
+// application's registers instead.
+static uint8_t bootloader_listened(void)
+{
+    return left.r10 == 0x11 && left.r11 == 0x05 && left.r14 == 0x01 && left.r15 == 0x08;
+}
+
+// MCUSR says it when the bootloader left it alone; later versions of Optiboot hand it over in r2. Optiboot before
+// 4.6 clears it: then a lost signature means that power was off.
 static uint8_t find_cause(void)
 {
     const uint8_t known = SG_RESET_POWER | SG_RESET_EXTERNAL | SG_RESET_BROWNOUT | SG_RESET_WATCHDOG;
     const uint16_t version = pgm_read_word(BOOTLOADER_VERSION_AT);
     if (left_mcusr & known)
         return left_mcusr & known;
-    if (version >= OPTIBOOT_KEEPS_CAUSE && version != 0xFFFF && (left_r2 & known))
-        return left_r2 & known;
-    if (left_uart)
+    if (version >= OPTIBOOT_KEEPS_CAUSE && version != 0xFFFF && (left.r2 & known))
+        return left.r2 & known;
+    if (bootloader_listened())
         return SG_RESET_EXTERNAL;
     return alive != ALIVE_SIGNATURE ? SG_RESET_POWER : SG_RESET_WATCHDOG;
 }
@@ -92,7 +103,7 @@ _Noreturn void boot_restart(void)
     PORTD = 0;
     if (pgm_read_word(BOOTLOADER_VERSION_AT) == 0xFFFF) {
         // The older bootloader never switches the watchdog off and would be reset by it for ever: start the
-        // application afresh instead. find_cause() takes the silent UART for the watchdog.
+        // application afresh instead. find_cause() takes that for the watchdog.
         wdt_disable();
         UCSR0B = 0;
         TIMSK1 = 0;

@@ -1,14 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 // The sensing engine: LED i senses while the other five emit, six slots of 600 us a frame, all in interrupts.
 //
-//   slot + 0      OCR1A    the other five light; ~5 us later the charged cathode is released, the release
-//   instant is
-//                          read from TCNT1, and OCR1B is set to release + exposure
-//   + exposure    OCR1B    hardware starts the ADC; sample-and-hold closes 260 cycles later. No code is
-//   involved + 8 cycles    OCR1A    lights out; the next LED's cathode is driven high
-//   + 92 us       ADC      code read; a throw-away conversion of the next channel charges the sample
-//   capacitor
-//                          to Vcc through that cathode
+//   slot + 0       OCR1A   the other five light; ~5 us later the charged cathode is released, the release
+//                          instant is read from TCNT1, and OCR1B is set to release + exposure
+//   + exposure     OCR1B   hardware starts the ADC; sample-and-hold closes 260 cycles later. No code involved
+//   + 8 cycles     OCR1A   lights out; the next LED's cathode is driven high
+//   + 92 us        ADC     code read; a throw-away conversion of the next channel charges the sample
+//                          capacitor to Vcc through that cathode
 // An interrupt that comes late moves the release and, with it, the sample: never the exposure.
 #include "port.h"
 
@@ -33,7 +31,7 @@ enum {
     ADMUX_AVCC = 1 << REFS0,
 };
 _Static_assert(EXPOSURE_MIN_CYCLES > EXPOSURE_FIXED_CYCLES + SOON_CYCLES, "the trigger must lie ahead");
-_Static_assert((5 + 6) * CYCLES_PER_US + EXPOSURE_MAX_CYCLES < SLOT_CYCLES / 2, "lit at most half of a frame");
+_Static_assert((5 + 6) * CYCLES_PER_US + EXPOSURE_MAX_CYCLES < SLOT_CYCLES / 2, "lit at most half");
 
 struct slot {
     uint16_t release;               // TCNT1
