@@ -15,7 +15,7 @@ REPLY_TIMEOUT_S = 60.0          # real seconds for one answer; an `advance` comp
 
 class Time(NamedTuple):
     cycle: int
-    us: float
+    us: int
     running: bool
 
 
@@ -97,7 +97,7 @@ class VirtualControl:
 
     def time(self):
         cycle, us, running = self.command("time").split()[:3]
-        return Time(int(cycle), float(us), running == "1")
+        return Time(int(cycle), int(us), running == "1")
 
     def lockstep(self, on):
         """True: the virtual clock stands still except inside advance()."""
@@ -109,7 +109,7 @@ class VirtualControl:
         Returns (us, device_bytes): the time reached, and the bytes sent by the device since lockstep began.
         """
         now, device_bytes = self.command(f"advance {us} {host_bytes}").split()[:2]
-        return float(now), int(device_bytes)
+        return int(now), int(device_bytes)
 
     def barrier(self):
         """Returns once the simulator has noticed what happened on its port before: openings, changes of speed."""

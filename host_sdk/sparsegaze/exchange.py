@@ -9,7 +9,7 @@ from .wire import lib
 
 TRY_TIMEOUTS_S = (0.5, 1.0, 2.0)
 BUSY_WAIT_S = 0.02
-WINDOW = 4                      # requests under way at a time: the device's receive buffer has 128 bytes
+WINDOW = 2                      # requests under way at a time: a longer burst overruns the receiver while it senses
 STREAM_KEPT = 3 * 4096          # stream packets kept while nobody takes them
 
 

@@ -7,6 +7,7 @@ BOOTLOADERS = ((115200, "Optiboot"), (57600, "ATmegaBOOT"))
 SIGNATURE = b"\x1e\x95\x0f"     # ATmega328P
 PAGE_BYTES = 128
 
+RESET_SETTLE_S = 0.05           # until the bootloader has switched its receiver on: half a command would confuse it
 SYNC_WAIT_S = 0.6               # Optiboot blinks for 0.4 s first; see Bootloader.sync
 ANSWER_WAIT_S = 1.0
 RESETS_PER_SPEED = 2
@@ -38,7 +39,10 @@ class Bootloader:
             for baud, name in BOOTLOADERS:
                 # At the wrong speed a bootloader hears garbage and may start the application: reset per try.
                 self.link.set_baud(baud)
-                if self.link.reset() and self._sync(SYNC_WAIT_S, 2):
+                if not self.link.reset():
+                    continue
+                self.link.sleep(RESET_SETTLE_S)
+                if self._sync(SYNC_WAIT_S, 2):
                     return self._found(baud, name)
         self._wait_for_button(progress)
 

@@ -219,7 +219,7 @@ class LockstepLink(SerialLink):
         return True
 
     def read(self, n, timeout_s):
-        deadline = self._us + timeout_s * 1e6
+        deadline = self._us + _whole_us(timeout_s)
         while not self._ready and self._us < deadline:
             self._advance(min(self._us + self._slice_us, deadline))
             # Whoever only listens needs no quick answer: longer slices cost fewer round trips.
@@ -250,12 +250,12 @@ class LockstepLink(SerialLink):
         return self._us * 1e-6
 
     def sleep(self, seconds):
-        end = self._us + seconds * 1e6
+        end = self._us + _whole_us(seconds)
         while self._us < end:
             self._advance(min(self._us + LOCKSTEP_SLEEP_US, end))
 
     def _advance(self, us):
-        self._us, device_bytes = self.control.advance(math.ceil(us), self._sent)
+        self._us, device_bytes = self.control.advance(us, self._sent)
         patience = time.monotonic() + LOCKSTEP_PATIENCE_S
         while self._received < device_bytes:
             data = self._read_slice(device_bytes - self._received, READ_SLICES_S[0])
@@ -264,6 +264,11 @@ class LockstepLink(SerialLink):
             if not data and time.monotonic() > patience:
                 raise DisconnectedError(f"{self.port} holds back bytes that the virtual Nano has sent",
                                         "is another program reading from this port?")
+
+
+def _whole_us(seconds):
+    # Rounded up: whoever waits for what is left of an interval must see time pass, however little is left.
+    return math.ceil(seconds * 1e6) if seconds > 0 else 0
 
 
 def _number(error):
