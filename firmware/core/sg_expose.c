@@ -69,7 +69,7 @@ static uint16_t clipped(uint32_t exposure_cycles)
 
 uint16_t sg_expose_from_us_q2(uint16_t exposure_us_q2)
 {
-    return clipped((uint32_t)exposure_us_q2 * (SG_EXPOSE_CYCLES_PER_US / 4U));
+    return clipped((uint32_t)exposure_us_q2 * ((uint16_t)SG_EXPOSE_CYCLES_PER_US >> 2));
 }
 
 uint16_t sg_expose_to_us_q2(uint16_t exposure_cycles)

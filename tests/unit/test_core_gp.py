@@ -10,7 +10,7 @@ import pytest
 from core_models import Parts, View, bound_deg, features_near, random_parts, real_mean_deg, scaled, twin
 from sparsegaze._core import ffi, lib
 
-GOLDEN_CRC = 0x7302D552     # see test_golden_crc_of_64_predictions
+GOLDEN_CRC = 0x8E84C0DF     # see test_golden_crc_of_64_predictions
 EXTREMES = (0, 1, 2, 0x7FFF, 0x8000, 0xFFFE, 0xFFFF)
 
 
@@ -175,11 +175,15 @@ class FrozenDraws:
 
 
 def golden_case():
-    """The fixed model and its 64 features, of which 48 are inside the box."""
+    """The fixed model and its 64 features: 48 at growing distances around a vector each, 16 anywhere. The guards
+    are tight enough that each of them decides about some."""
     draws = FrozenDraws(20)
     parts = random_parts(draws, 64)
-    wild = draws.integers(0, 65536, (16, 6)).astype(np.uint16)
-    return parts, np.concatenate([features_near(draws, parts, 48), wild])
+    limits = ((0, 500000), (-200000, 200000), (-600000, 0))
+    parts.guard = [(low, high, row) for (low, high), (_, _, row) in zip(limits, parts.guard)]
+    near = parts.centre[:48] * 16 + draws.integers(-64, 65, (48, 6)) * (np.arange(48)[:, None] // 4)
+    near = (parts.offset + (near.clip(0, 4095) * 4096 + 2048) // parts.gain_q12).clip(0, 65535)
+    return parts, np.concatenate([near, draws.integers(0, 65536, (16, 6))]).astype(np.uint16)
 
 
 def golden_crc(core_ffi=ffi, core_lib=lib):
@@ -197,3 +201,13 @@ def test_golden_crc_of_64_predictions():
     crc = golden_crc()
     print(f"golden CRC-32 over 64 predictions: {crc:08x}")
     assert crc == GOLDEN_CRC
+
+
+def test_golden_case_exercises_every_guard_and_every_size_of_kernel():
+    parts, feature = golden_case()
+    s, clamped = scaled(parts, feature)
+    broken = np.array([(s @ row < low) | (s @ row > high) for low, high, row in parts.guard])
+    alone = broken & (broken.sum(axis=0) == 1) & ~clamped
+    assert alone.any(axis=1).all() and (~broken.any(axis=0) & ~clamped).any()
+    t = ((s * s).sum(axis=1) >> 5)[:, None] + parts.half_c2 - s @ parts.centre.T
+    assert (t < 1024).any() and (t >= 1 << 20).any() and len(np.unique((t[t < 1 << 20]) >> 16)) == 16

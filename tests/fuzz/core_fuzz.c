@@ -1,0 +1,239 @@
+// SPDX-License-Identifier: Apache-2.0
+// Hostile bytes for everything of the core that reads what others wrote, to be built with -fsanitize=address,undefined.
+// Every input lies in a heap block of exactly its size, so that one byte too far is seen.
+//
+//   core_fuzz SEED ROUNDS      prints one line of counts; a broken invariant aborts with its name
+//
+// Invariants: decode never returns more than 64 nor writes beyond; what decodes re-encodes to the same bytes; a
+// receiver is back in step one delimiter after anything; whatever sg_model_open accepts can be predicted from, with
+// any feature; nothing is written to a view that was refused.
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "sg_err.h"
+#include "sg_expose.h"
+#include "sg_gp.h"
+#include "sg_link.h"
+#include "sg_model.h"
+#include "sg_track.h"
+#include "sg_wire.h"
+
+#define HOLDS(condition, name)                             \
+    do {                                                   \
+        if (!(condition)) {                                \
+            fprintf(stderr, "broken invariant: %s\n", name); \
+            abort();                                       \
+        }                                                  \
+    } while (0)
+
+static uint64_t state;
+
+static uint32_t draw(uint32_t below)
+{
+    state = state * 6364136223846793005u + 1442695040888963407u;
+    return (uint32_t)((state >> 33) % below);
+}
+
+static void fill(uint8_t *data, size_t n)
+{
+    const uint32_t mode = draw(4);  // anything, few zeros, many zeros, small codes as COBS likes them
+    for (size_t i = 0; i < n; i++) {
+        data[i] = (uint8_t)draw(256);
+        if (mode == 1 && data[i] == 0)
+            data[i] = 1;
+        if (mode == 2 && draw(3) == 0)
+            data[i] = 0;
+        if (mode == 3)
+            data[i] = (uint8_t)(1 + data[i] % 20);
+    }
+}
+
+static uint8_t *block(size_t n)
+{
+    uint8_t *data = malloc(n ? n : 1);
+    HOLDS(data != NULL, "memory");
+    return data;
+}
+
+static unsigned long decoded, opened, refused[16];
+
+static void fuzz_decode(void)
+{
+    const size_t n = draw(100);
+    uint8_t *frame = block(n);
+    uint8_t *body = block(SG_WIRE_BODY_MAX);
+    struct sg_head head;
+    fill(frame, n);
+    if (draw(2)) {  // a good frame, perhaps with one fault
+        free(frame);
+        frame = block(SG_WIRE_FRAME_MAX);
+        uint8_t content[SG_WIRE_BODY_MAX];
+        const size_t content_bytes = draw(SG_WIRE_BODY_MAX + 1);
+        fill(content, content_bytes);
+        head = (struct sg_head){ .seq = (uint16_t)draw(65536), .type = (uint8_t)draw(256), .flags = 0 };
+        int length = sg_wire_encode(&head, content, content_bytes, frame) - 1;
+        HOLDS(length == (int)content_bytes + 7, "encoded length");
+        uint8_t *exact = block((size_t)length);
+        memcpy(exact, frame, (size_t)length);
+        free(frame);
+        frame = exact;
+        const uint32_t fault = draw(3);
+        if (fault == 1)
+            exact[draw((uint32_t)length)] = (uint8_t)draw(256);
+        const int cut = fault == 2 ? (int)draw((uint32_t)length) : length;
+        const int got = sg_wire_decode(frame, (size_t)cut, &head, body);
+        HOLDS(fault != 0 || (got == (int)content_bytes && memcmp(body, content, content_bytes) == 0), "round trip");
+        decoded += got >= 0;
+    } else {
+        const int got = sg_wire_decode(frame, n, &head, body);
+        HOLDS(got <= SG_WIRE_BODY_MAX, "body length");
+        if (got >= 0) {
+            uint8_t again[SG_WIRE_FRAME_MAX];
+            const int m = sg_wire_encode(&head, body, (size_t)got, again);
+            HOLDS(m == (int)n + 1 && memcmp(again, frame, n) == 0, "one encoding per packet");
+            decoded++;
+        }
+    }
+    free(frame);
+    free(body);
+}
+
+static void fuzz_link(void)
+{
+    static struct sg_link_rx rx;  // goes on from round to round, as on a device
+    struct sg_head head;
+    uint8_t body[SG_WIRE_BODY_MAX], noise[300], frame[SG_WIRE_FRAME_MAX];
+    size_t used;
+    const size_t n = draw(sizeof noise);
+    fill(noise, n);
+    for (size_t at = 0; at < n; at += used) {
+        const int got = sg_link_feed(&rx, noise + at, n - at, &used, &head, body);
+        HOLDS(used > 0 && used <= n - at && got <= SG_WIRE_BODY_MAX, "progress of the receiver");
+    }
+    head = (struct sg_head){ .seq = (uint16_t)draw(65536), .type = 1, .flags = 0 };
+    const uint16_t seq = head.seq;
+    const int m = sg_wire_encode(&head, noise, n % (SG_WIRE_BODY_MAX + 1), frame);
+    sg_link_receive(&rx, 0, &head, body);
+    const int got = sg_link_feed(&rx, frame, (size_t)m, &used, &head, body);
+    HOLDS(got == (int)(n % (SG_WIRE_BODY_MAX + 1)) && head.seq == seq && used == (size_t)m, "back in step");
+}
+
+static void put32(uint8_t *at, uint32_t value)
+{
+    for (int i = 0; i < 4; i++)
+        at[i] = (uint8_t)(value >> (8 * i));
+}
+
+// A model that is right in form, with wild content, then some damage, then often a CRC that fits the damage.
+static size_t make_model(uint8_t **out)
+{
+    const uint8_t vectors = (uint8_t)(1 + draw(draw(8) ? 20 : SG_MODEL_VECTORS_MAX));
+    const size_t n = SG_MODEL_HEAD_BYTES + (size_t)vectors * SG_MODEL_RECORD_BYTES;
+    uint8_t *image = block(n);
+    memset(image, 0, n);
+    put32(image, SG_MODEL_MAGIC);
+    put32(image + offsetof(struct sg_model_head, length), (uint32_t)n);
+    for (size_t i = offsetof(struct sg_model_head, bias); i < offsetof(struct sg_model_head, version); i++)
+        image[i] = (uint8_t)draw(256);
+    image[offsetof(struct sg_model_head, version)] = SG_MODEL_VERSION;
+    image[offsetof(struct sg_model_head, vectors)] = vectors;
+    image[offsetof(struct sg_model_head, channels)] = SG_MODEL_CHANNELS;
+    image[offsetof(struct sg_model_head, weight_frac_bits)] = (uint8_t)(6 + draw(5));
+    const uint8_t guards = (uint8_t)draw(9);
+    image[offsetof(struct sg_model_head, guards)] = guards;
+    for (uint8_t i = 0; i < guards; i++) {
+        uint8_t *guard = image + SG_MODEL_PAGE + i * sizeof(struct sg_model_guard);
+        for (size_t j = 0; j < offsetof(struct sg_model_guard, reserved); j++)
+            guard[j] = (uint8_t)draw(256);
+        guard[3] |= 0x80;   // low < 0 <= high
+        guard[7] &= 0x7F;
+    }
+    for (size_t i = SG_MODEL_HEAD_BYTES; i < n; i++)
+        image[i] = (uint8_t)draw(256);
+    for (uint8_t i = 0; i < vectors; i++)
+        image[SG_MODEL_HEAD_BYTES + i * SG_MODEL_RECORD_BYTES + 2] &= 0x3F;
+    for (uint32_t damage = draw(3); damage != 0; damage--)
+        image[draw(draw(2) ? SG_MODEL_HEAD_BYTES : (uint32_t)n)] ^= (uint8_t)(1u << draw(8));
+    if (draw(8))
+        put32(image + 4, sg_model_crc32(0, image + 8, n - 8));
+    *out = image;
+    return n;
+}
+
+static void fuzz_model(void)
+{
+    uint8_t *image;
+    size_t n;
+    if (draw(4) == 0) {
+        n = draw(600);
+        image = block(n);
+        fill(image, n);
+        if (n >= 4 && draw(2))
+            put32(image, SG_MODEL_MAGIC);
+    } else {
+        n = make_model(&image);
+    }
+    if (draw(6) == 0 && n > 0) {  // cut short, in a block of the new size
+        n = draw((uint32_t)n);
+        uint8_t *shorter = block(n);
+        memcpy(shorter, image, n);
+        free(image);
+        image = shorter;
+    }
+    struct sg_model_view view, untouched;
+    memset(&view, 0x5A, sizeof view);
+    memcpy(&untouched, &view, sizeof view);
+    const int verdict = sg_model_open(&view, image, (uint32_t)n, 0);
+    HOLDS(verdict <= 0 && verdict > -16, "verdict");
+    if (verdict == SG_OK) {
+        opened++;
+        HOLDS(view.length <= n, "length inside the room");
+        for (int i = 0; i < 4; i++) {
+            uint16_t feature[6];
+            for (int j = 0; j < 6; j++)
+                feature[j] = (uint16_t)(draw(3) ? draw(65536) : (draw(2) ? 65535 : 0));
+            const int16_t recentre[2] = { (int16_t)(draw(65536) - 32768), (int16_t)(draw(65536) - 32768) };
+            struct sg_gaze gaze;
+            const int result = sg_track_infer(&view, feature, (uint8_t)draw(256), recentre, &gaze);
+            HOLDS(result == SG_OK || result == SG_E_RANGE, "result of inference");
+            HOLDS(result == SG_OK || !(gaze.flags & SG_FLAG_VALID), "a saturated gaze is not valid");
+        }
+    } else {
+        refused[-verdict]++;
+        HOLDS(memcmp(&view, &untouched, sizeof view) == 0, "a refused image leaves the view alone");
+    }
+    free(image);
+}
+
+static void fuzz_expose(void)
+{
+    struct sg_expose_led led;
+    sg_expose_start(&led, (uint16_t)draw(65536));
+    for (int i = 0; i < 50; i++) {
+        uint16_t feature;
+        const uint16_t code = (uint16_t)draw(draw(2) ? 1024 : 65536), cycles = (uint16_t)draw(65536);
+        sg_expose_feature(code, cycles, &feature);
+        sg_expose_step(&led, code, draw(2) ? led.exposure_cycles : cycles);
+        HOLDS(led.exposure_cycles >= SG_EXPOSE_MIN_CYCLES && led.exposure_cycles <= SG_EXPOSE_MAX_CYCLES, "limits");
+    }
+}
+
+int main(int argc, char **argv)
+{
+    if (argc != 3)
+        return 2;
+    state = strtoull(argv[1], NULL, 10) * 2654435761u + 1;
+    const unsigned long rounds = strtoul(argv[2], NULL, 10);
+    for (unsigned long i = 0; i < rounds; i++) {
+        fuzz_decode();
+        fuzz_link();
+        fuzz_model();
+        if (i % 16 == 0)
+            fuzz_expose();
+    }
+    printf("decoded %lu opened %lu short %lu magic %lu version %lu bounds %lu crc %lu\n", decoded, opened,
+           refused[-SG_E_SHORT], refused[-SG_E_MAGIC], refused[-SG_E_VERSION], refused[-SG_E_BOUNDS],
+           refused[-SG_E_CRC]);
+    return 0;
+}

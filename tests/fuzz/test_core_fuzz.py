@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The core under hostile bytes, with address and undefined-behaviour sanitizers.
+
+SPARSEGAZE_FUZZ_ROUNDS in the environment lengthens the run (default 20000 rounds per seed)."""
+import os
+import pathlib
+import shutil
+import subprocess
+
+import pytest
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+CORE = ROOT / "firmware" / "core"
+ROUNDS = os.environ.get("SPARSEGAZE_FUZZ_ROUNDS", "20000")
+FLAGS = ["-std=c11", "-O1", "-g", "-Wall", "-Wextra", "-Werror", "-fsanitize=address,undefined",
+         "-fno-sanitize-recover=all", "-fno-omit-frame-pointer"]
+
+
+def build(directory, core=CORE):
+    """Compile the fuzz program; returns its path."""
+    target = directory / "core_fuzz"
+    done = subprocess.run(["gcc", *FLAGS, f"-I{core}", *sorted(core.glob("*.c")),
+                           pathlib.Path(__file__).parent / "core_fuzz.c", "-o", target], capture_output=True,
+                          text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return target
+
+
+def run(program, seed, rounds=ROUNDS):
+    """(exit code, stdout, stderr)."""
+    done = subprocess.run([program, str(seed), rounds], capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    """The fuzz program."""
+    return build(tmp_path_factory.mktemp("fuzz"))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_random_and_damaged_bytes_break_no_invariant(program, seed):
+    code, out, err = run(program, seed)
+    print(out)
+    assert code == 0, err
+    words = out.split()
+    counts = {words[i]: int(words[i + 1]) for i in range(0, len(words), 2)}
+    assert set(counts) == {"decoded", "opened", "short", "magic", "version", "bounds", "crc"}
+    assert all(counts.values()), counts         # every way out was taken
+
+
+FAULTS = {
+    "a decoder that trusts the code byte": (
+        "sg_wire.c", "        if ((size_t)(code - 1U) > n - at)\n            return SG_E_SHORT;\n", ""),
+    "a decoder that trusts the length": ("sg_wire.c", "frame[at] == 0 || fill == SG_WIRE_PACKET_MAX", "frame[at] == 0"),
+    "a model opened without its length": ("sg_model.c", "    if (length > room)\n        return SG_E_SHORT;\n", ""),
+    "a receiver that never forgets": ("sg_link.c", "    rx->fill = 0;\n", "    rx->fill = fill > 71 ? 72 : 0;\n"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_fuzzer_finds_a_planted_fault(fault, tmp_path):
+    name, right, wrong = FAULTS[fault]
+    core = tmp_path / "core"
+    shutil.copytree(CORE, core)
+    text = (core / name).read_text(encoding="utf-8")
+    assert text.count(right) == 1
+    (core / name).write_text(text.replace(right, wrong), encoding="utf-8")
+    code, _, err = run(build(tmp_path, core), 1, "3000")
+    assert code != 0 and ("ERROR: AddressSanitizer" in err or "broken invariant" in err or "runtime error" in err)

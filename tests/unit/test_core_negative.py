@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Negative controls: a copy of the core with one deliberate fault must turn its test red."""
+import importlib.util
+import shutil
+
+import numpy as np
+import pytest
+
+import core_avr_harness as avr
+from core_models import View, features_near, random_parts, twin
+from sparsegaze import _core_build
+from test_core_gp import GOLDEN_CRC, golden_crc
+
+FAULTS = {
+    "the shift of the interpolated drop": ("sg_gp_loop.c", "fraction_q10) >> 16)", "fraction_q10) >> 15)"),
+    "the sign of a weight": ("sg_gp_loop.c", "sum->acc[1] = acc_elevation;", "sum->acc[1] = 0U - acc_elevation;"),
+    "the kernel's end": ("sg_gp_loop.c", "t >= 0x100000UL", "t >= 0x080000UL"),
+    "the scale of S2": ("sg_gp.c", "sum_s2 >> 5", "sum_s2 >> 4"),
+    "the rounding": ("sg_q.h", "((x >> (bits - 1U)) + 1) >> 1", "x >> bits"),
+    "one guard left out": ("sg_gp.c", "i < view->guards", "i + 1 < view->guards"),
+    "one table entry": ("sg_gp_table.c", "65535, ", "65534, "),
+}
+
+
+def build(core, directory):
+    """Compile a core directory into its own extension and import it under another name."""
+    path = _core_build.build(str(directory), str(core))
+    spec = importlib.util.spec_from_file_location("sparsegaze._core", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def core_copy(tmp_path):
+    """The core's sources, to be altered."""
+    shutil.copytree(avr.CORE, tmp_path / "core")
+    (tmp_path / "out").mkdir()
+    return tmp_path / "core"
+
+
+def test_an_unaltered_copy_is_green(core_copy):
+    module = build(core_copy, core_copy.parent / "out")
+    assert golden_crc(module.ffi, module.lib) == GOLDEN_CRC
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_broken_core_turns_the_golden_vectors_red(fault, core_copy):
+    name, right, wrong = FAULTS[fault]
+    text = (core_copy / name).read_text(encoding="utf-8")
+    assert text.count(right) == 1
+    (core_copy / name).write_text(text.replace(right, wrong), encoding="utf-8")
+    module = build(core_copy, core_copy.parent / "out")
+    assert golden_crc(module.ffi, module.lib) != GOLDEN_CRC
+
+
+def test_a_wrong_twin_would_be_noticed():
+    rng = np.random.default_rng(0)
+    parts = random_parts(rng, 64)
+    feature = features_near(rng, parts, 50)
+    view = View(parts.image())
+    parts.centre = parts.centre.copy()
+    parts.centre[0, 0] ^= 1
+    expected, _ = twin(parts, feature)
+    assert (view.predict(feature)[0] != np.clip(expected, -32768, 32767)).any()
