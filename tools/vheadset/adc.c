@@ -14,6 +14,13 @@ enum { TRIGGER_SYNC_CYCLES = 3, CHANNEL_TEMPERATURE = 8, CHANNEL_BANDGAP = 14, C
 
 static avr_cycle_count_t on_end(avr_t *avr, avr_cycle_count_t when, void *param);
 
+static avr_cycle_count_t on_join(avr_t *avr, avr_cycle_count_t when, void *param)
+{
+    (void)avr;
+    adc_catch_up(param, when);
+    return 0;
+}
+
 static avr_cycle_count_t on_sample(avr_t *avr, avr_cycle_count_t when, void *param)
 {
     (void)avr;
@@ -29,9 +36,11 @@ static void start(struct adc *a, uint64_t edge, bool triggered)
     a->admux = a->avr->data[ADMUX];
     a->busy = true;
     a->avr->data[ADCSRA] |= ADSC;
+    a->join_at = edge;
     a->sample_at = edge + a->divisor * (a->first ? 27 : triggered ? 4 : 3) / 2;
     a->end_at = edge + a->divisor * (a->first ? 50 : triggered ? 27 : 26) / 2;
     a->first = false;
+    access_at(a->avr, a->join_at, on_join, a);
     access_at(a->avr, a->sample_at, on_sample, a);
     access_at(a->avr, a->end_at, on_end, a);
 }
@@ -47,13 +56,18 @@ void adc_trigger(struct adc *a, enum adc_source source, uint64_t cycle)
 
 void adc_catch_up(struct adc *a, uint64_t cycle)
 {
+    int channel = a->admux & 15;
+    if (a->join_at && a->join_at <= cycle) {
+        if (channel < LEDS_COUNT)
+            leds_join(a->leds, channel, a->join_at, a->held_volts);
+        a->join_at = 0;
+    }
     if (!a->sample_at || a->sample_at > cycle)
         return;
     uint64_t at = a->sample_at;
-    int channel = a->admux & 15;
     a->sample_at = 0;
     if (channel < LEDS_COUNT)
-        a->held_volts = leds_sample(a->leds, channel, at, a->held_volts);
+        a->held_volts = leds_sample(a->leds, channel, at);
     else if (channel == CHANNEL_TEMPERATURE)
         a->held_volts = 0.314 + 0.001 * leds_temperature_k(a->leds);
     else if (channel == CHANNEL_BANDGAP)
@@ -147,10 +161,12 @@ static void write_control(avr_t *avr, avr_io_addr_t at, uint8_t value, void *par
     access_edge_enabled(avr, a->vector);
     if (!(value & ADEN)) {
         avr->data[at] &= (uint8_t)~ADSC;
+        avr_cycle_timer_cancel(avr, on_join, a);
         avr_cycle_timer_cancel(avr, on_sample, a);
+        leds_part(a->leds, now);
         avr_cycle_timer_cancel(avr, on_end, a);
         a->busy = false;
-        a->sample_at = 0;
+        a->sample_at = a->join_at = 0;
         return;
     }
     if (!(was & ADEN)) {
@@ -198,6 +214,7 @@ void adc_reset(struct adc *a)
 {
     a->busy = a->locked = false;
     a->first = true;
-    a->sample_at = 0;
+    a->sample_at = a->join_at = 0;
+    leds_part(a->leds, a->avr->cycle);
     a->prescale_base = a->avr->cycle;
 }

@@ -31,6 +31,7 @@ struct adc {
     avr_int_vector_t *vector;
     uint64_t seed;
     uint64_t prescale_base;       // an edge of every prescaler tap
+    uint64_t join_at;             // sample capacitor to the input; 0 once done
     uint64_t sample_at, end_at;   // of the conversion under way; sample_at = 0 once sampled
     uint64_t conversions;         // counts draws
     double held_volts;            // on the sample capacitor
@@ -45,7 +46,7 @@ void adc_attach(struct adc *adc, avr_t *avr, struct leds *leds, const struct phy
 void adc_reset(struct adc *adc);
 // The rising edge of a trigger source at a cycle.
 void adc_trigger(struct adc *adc, enum adc_source source, uint64_t cycle);
-// Take the sample now if its moment is not after `cycle`: called before anything it depends on changes.
+// Do what of joining and sampling is due by `cycle`: called before anything they depend on changes.
 void adc_catch_up(struct adc *adc, uint64_t cycle);
 
 #endif

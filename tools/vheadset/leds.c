@@ -95,6 +95,11 @@ static double ambient_na(const struct leds *l, uint64_t from, uint64_t to)
     return steady * (1 - l->ambient_flicker * wave);
 }
 
+static double joined_pf(const struct leds *l, int i)
+{
+    return l->joined == i ? l->physics->node.sample_hold_pf : 0;
+}
+
 // Bring a floating node's voltage forward.
 static void discharge(struct leds *l, int i, uint64_t to)
 {
@@ -121,7 +126,9 @@ static void discharge(struct leds *l, int i, uint64_t to)
         }
         charge_fc += current_na * (double)(end - from) / 16.0;
     }
-    led->volts = leds_volts(l->physics, leds_charge_pc(l->physics, led->volts, 0) - charge_fc * 1e-3, 0);
+    double extra_pf = joined_pf(l, i);
+    led->volts = leds_volts(l->physics, leds_charge_pc(l->physics, led->volts, extra_pf) - charge_fc * 1e-3,
+                            extra_pf);
     led->since = to;
     led->stretch[0] = (struct led_stretch){to, l->lit};
     led->stretches = 1;
@@ -133,7 +140,7 @@ static void pull_up(struct leds *l, int i, uint64_t to)
     struct led *led = &l->led[i];
     double supply = leds_supply_volts(l, to), left_s = (double)(to - led->since) / 16e6;
     while (left_s > 0 && supply - led->volts > 1e-6) {
-        double tau = PULLUP_OHM * capacitance_pf(l->physics, led->volts) * 1e-12;
+        double tau = PULLUP_OHM * (capacitance_pf(l->physics, led->volts) + joined_pf(l, i)) * 1e-12;
         double step = fmin(left_s, tau / 16);
         led->volts += (supply - led->volts) * -expm1(-step / tau);
         left_s -= step;
@@ -224,19 +231,40 @@ static void pins_changed(struct leds *l, uint64_t now)
         }
 }
 
-double leds_sample(struct leds *l, int channel, uint64_t cycle, double held_volts)
+static bool driven(const struct led *led)
+{
+    return led->drive == LED_OFF || led->drive == LED_EMIT || led->drive == LED_REVERSE;
+}
+
+void leds_join(struct leds *l, int channel, uint64_t cycle, double held_volts)
 {
     struct led *led = &l->led[channel];
     double sampler_pf = l->physics->node.sample_hold_pf;
+    if (!driven(led)) {
+        bring_to(l, channel, cycle);
+        double total_pc = leds_charge_pc(l->physics, led->volts, 0) + sampler_pf * held_volts;
+        led->volts = leds_volts(l->physics, total_pc, sampler_pf);
+    }
+    l->joined = channel;
+}
+
+double leds_sample(struct leds *l, int channel, uint64_t cycle)
+{
+    struct led *led = &l->led[channel];
     uint64_t n = l->samples++;
-    if (led->drive == LED_OFF || led->drive == LED_EMIT)
-        return 0;
+    if (!driven(led))
+        bring_to(l, channel, cycle);
+    l->joined = -1;
     if (led->drive == LED_REVERSE)
         return leds_supply_volts(l, cycle) + ripple(l, NOISE_RIPPLE_SAMPLE, n);
-    bring_to(l, channel, cycle);
-    double total_pc = leds_charge_pc(l->physics, led->volts, 0) + sampler_pf * held_volts;
-    led->volts = leds_volts(l->physics, total_pc, sampler_pf);
-    return led->volts;
+    return driven(led) ? 0 : led->volts;
+}
+
+void leds_part(struct leds *l, uint64_t cycle)
+{
+    if (l->joined >= 0 && !driven(&l->led[l->joined]))
+        bring_to(l, l->joined, cycle);
+    l->joined = -1;
 }
 
 double leds_peek(struct leds *l, int i, uint64_t cycle)
@@ -326,6 +354,7 @@ void leds_attach(struct leds *l, avr_t *avr, struct adc *adc, struct person *per
     const struct physics *p = &config->physics;
     memset(l, 0, sizeof *l);
     l->avr = avr;
+    l->joined = -1;
     l->adc = adc;
     l->person = person;
     l->map = map;

@@ -6,9 +6,11 @@
 // Charge    F(V) = Qj(V) + pin_pf V, Qj(V) = integral of C0 / (1 + v/0.7)^0.4 from 0 to V. Integrated exactly: the
 //           charge collected while floating is a sum over stretches of constant emitters, each with the response map at
 //           its middle; F is then inverted by Newton's method (to 1e-12 V).
-// Sampling  the sample capacitor, still holding the last converted voltage, is joined to the node: the sum of both
-//           charges is kept. A driven node is stiff and simply charges it.
-// Floor     illuminated, the junction stops at a forward voltage: the node does not fall below -0.25 V.
+// Sampling  from the start of a conversion to its sample, the sample capacitor, still holding the last converted voltage,
+//           hangs on the node: the sum of both charges is kept, and both are discharged together. A driven node is
+//           stiff and simply charges it.
+// Floor     illuminated, the junction stops at a forward voltage: the node does not fall below -0.25 V. The charged
+//           capacitor joins late, so a channel that ran into the floor reads 1.1 V or less, not zero.
 // Supply    each lit emitter draws 20 mA through source_ohm; ripple is drawn anew for every release of a node, every
 //           sample of a driven node and every conversion's reference.
 #ifndef LEDS_H
@@ -65,6 +67,7 @@ struct leds {
     struct led_stretch history[LEDS_HISTORY];  // ring of changes of `lit`, for the supply
     unsigned history_next;
     uint64_t releases, samples;                // count draws
+    int joined;                                // LED whose node carries the sample capacitor, or -1
     uint64_t response_cycle;
     bool response_known;
     double response[LEDS_COUNT * LEDS_COUNT];
@@ -79,8 +82,12 @@ void leds_reset(struct leds *leds, bool fresh);
 void leds_set_ambient(struct leds *leds, enum ambient ambient);
 void leds_set_light(struct leds *leds, enum light light);
 
-// Sample the node of a channel at a cycle onto a capacitor that holds held_volts. Returns the common voltage.
-double leds_sample(struct leds *leds, int channel, uint64_t cycle, double held_volts);
+// Join the sample capacitor, which holds held_volts, to the node of a channel at a cycle.
+void leds_join(struct leds *leds, int channel, uint64_t cycle, double held_volts);
+// Separate it again. Returns the voltage it now holds.
+double leds_sample(struct leds *leds, int channel, uint64_t cycle);
+// Separate it at a conversion that was called off.
+void leds_part(struct leds *leds, uint64_t cycle);
 // Supply at a recent cycle, without ripple.
 double leds_supply_volts(const struct leds *leds, uint64_t cycle);
 double leds_temperature_k(const struct leds *leds);  // above 25 C

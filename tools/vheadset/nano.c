@@ -27,6 +27,8 @@ static void run_batch(struct nano *nano)
     avr_flashaddr_t pc = avr->pc;
     if (avr->state == cpu_Running)
         pc = avr_run_one(avr);
+    if (avr->interrupt_state == -2)
+        avr->interrupt_state = -1;  // one instruction after SEI or RETI is safe from interrupts, not two
     avr_cycle_count_t idle = avr_cycle_timer_process(avr);
     avr->pc = pc;
     if (nano->watchdog.expired)
