@@ -70,6 +70,7 @@ class Bootloader:
             while self.link.now() - start < half * PRESS_WAIT_S / len(BOOTLOADERS):
                 if progress is not None:
                     progress("press reset", self.link.now() - start, PRESS_WAIT_S)
+                self.link.sleep(RESET_SETTLE_S)     # the button may have been pressed just now
                 if self._sync(SYNC_WAIT_S, 1):
                     return self._found(baud, name)
         raise FlashError(f"no bootloader answers on {self.link.port} at 115200 or 57600 baud",

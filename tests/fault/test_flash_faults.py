@@ -5,7 +5,7 @@ import termios
 
 import numpy as np
 import pytest
-from conftest import make_hex
+from material import make_hex
 from fake_board import FakeBoard, PtyPeer
 
 from sparsegaze import stk500

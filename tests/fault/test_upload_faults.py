@@ -4,7 +4,7 @@
 import random
 
 import pytest
-from conftest import make_image
+from material import make_image
 from fake_board import FakeBoard
 
 from sparsegaze import device as device_module
