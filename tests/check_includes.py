@@ -11,7 +11,8 @@ from pathlib import Path
 
 FREESTANDING = {"stddef.h", "stdint.h", "stdbool.h", "limits.h", "stdalign.h"}
 
-# Module of the core -> modules whose header it may include besides its own. Siblings never include each other.
+# Module of the core -> modules whose header it may include besides its own. Siblings never include each
+# other.
 CORE = {
     "sg_q": set(), "sg_rom": set(), "sg_err": set(),
     "sg_wire": {"sg_err"},
@@ -22,7 +23,8 @@ CORE = {
     "sg_gp_loop": {"sg_rom", "sg_model"}, "sg_gp_table": {"sg_gp_loop", "sg_rom"}, "sg_gp_avr": set(),
     "sg_track": {"sg_err", "sg_q", "sg_wire", "sg_model", "sg_gp", "sg_expose"},
 }
-ARCHITECTURE = re.compile(r"__AVR|__arm__|__ARM|__x86_64|__i386|_M_X64|__riscv|__thumb|_WIN32|__linux__|__APPLE__")
+ARCHITECTURE = re.compile(r"__AVR|__arm__|__ARM|__x86_64|__i386|_M_X64|__riscv|__thumb|_WIN32|__linux__|"
+                          r"__APPLE__")
 ARCHITECTURE_FILES = {"sg_rom.h", "sg_gp_avr.S"}
 CONDITIONS = {"sg_gp_loop.c": {"SG_GP_ASSEMBLY"}}       # besides include guards
 FORBIDDEN = {
@@ -95,7 +97,8 @@ def check_core_content(path, text):
         for pattern, what in FORBIDDEN.items():
             if re.search(pattern, line):
                 yield Breach(path, number, f"{what} in the core")
-        if re.match(r"(static\s+)?(?!const\b|extern\b|typedef\b|static\s+(inline|const)\b)(struct \w+|u?int\d+_t)\s+\w+"
+        if re.match(r"(static\s+)?(?!const\b|extern\b|typedef\b|static\s+(inline|const)\b)"
+                    r"(struct \w+|u?int\d+_t)\s+\w+"
                     r"(\[[^]]*\])*\s*(=|;)", line):
             yield Breach(path, number, "a global variable")
         if re.match(r"\s+static\s+(?!const\b)", line):
@@ -153,12 +156,14 @@ def check(root):
         found += check_core_content(path, text)
     found += check_recursion([(p, t) for p, t in core if p.suffix != ".S"])
     standard = "|".join(re.escape(h) for h in sorted(FREESTANDING | {"string.h"}))
-    found += check_layer(read(root, "firmware/app", ".c", ".h"), r"sg_\w+\.h|hal\.h|hal_port\.h|app\w*\.h", standard,
-                         "the application")
+    found += check_layer(read(root, "firmware/app", ".c", ".h"), r"sg_\w+\.h|hal\.h|hal_port\.h|app\w*\.h",
+                         standard, "the application")
     found += check_layer(read(root, "firmware/ports", ".c", ".h"), r"hal\.h|hal_port\.h|port\w*\.h",
                          standard + r"|(avr|util)/\w+\.h", "a port")
-    found += check_layer(read(root, "sim_c", ".c", ".h"), r"sim_\w+\.h", r"(?!simavr|avr/|Python).*", "the simulator")
-    found += check_layer(read(root, "tools/vheadset", ".c", ".h"), r"(?!.*\bsg_)(?!\.\./(?!\.\./sim_c/sim_map\.h)).*",
+    found += check_layer(read(root, "sim_c", ".c", ".h"), r"sim_\w+\.h", r"(?!simavr|avr/|Python).*",
+                         "the simulator")
+    found += check_layer(read(root, "tools/vheadset", ".c", ".h"),
+                         r"(?!.*\bsg_)(?!\.\./(?!\.\./sim_c/sim_map\.h)).*",
                          r".*", "the virtual Nano")
     for path, text in read(root, "host_sdk", ".py"):
         for number, line in enumerate(text.splitlines(), 1):

@@ -7,7 +7,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
-// exp(-T / (16 u^2)) over T >> 10 as 1024 pairs (drop to the next level Q10.6, level Q0.16); see make_tables.py.
+// exp(-T / (16 u^2)) over T >> 10 as 1024 pairs (drop to the next level Q10.6, level Q0.16); see
+// make_tables.py.
 extern const uint16_t sg_gp_exp_table[2048];
 
 struct sg_gp_sum {

@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-// Hostile bytes for everything of the core that reads what others wrote, to be built with -fsanitize=address,undefined.
-// Every input lies in a heap block of exactly its size, so that one byte too far is seen.
+// Hostile bytes for everything of the core that reads what others wrote, to be built with
+// -fsanitize=address,undefined. Every input lies in a heap block of exactly its size, so that one byte too
+// far is seen.
 //
 //   core_fuzz SEED ROUNDS      prints one line of counts; a broken invariant aborts with its name
 //
-// Invariants: decode never returns more than 64 nor writes beyond; what decodes re-encodes to the same bytes; a
-// receiver is back in step one delimiter after anything; whatever sg_model_open accepts can be predicted from, with
-// any feature; nothing is written to a view that was refused.
+// Invariants: decode never returns more than 64 nor writes beyond; what decodes re-encodes to the same bytes;
+// a receiver is back in step one delimiter after anything; whatever sg_model_open accepts can be predicted
+// from, with any feature; nothing is written to a view that was refused.
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -83,7 +84,8 @@ static void fuzz_decode(void)
             exact[draw((uint32_t)length)] = (uint8_t)draw(256);
         const int cut = fault == 2 ? (int)draw((uint32_t)length) : length;
         const int got = sg_wire_decode(frame, (size_t)cut, &head, body);
-        HOLDS(fault != 0 || (got == (int)content_bytes && memcmp(body, content, content_bytes) == 0), "round trip");
+        HOLDS(fault != 0 || (got == (int)content_bytes && memcmp(body, content, content_bytes) == 0),
+              "round trip");
         decoded += got >= 0;
     } else {
         const int got = sg_wire_decode(frame, n, &head, body);
@@ -215,7 +217,8 @@ static void fuzz_expose(void)
         const uint16_t code = (uint16_t)draw(draw(2) ? 1024 : 65536), cycles = (uint16_t)draw(65536);
         sg_expose_feature(code, cycles, &feature);
         sg_expose_step(&led, code, draw(2) ? led.exposure_cycles : cycles);
-        HOLDS(led.exposure_cycles >= SG_EXPOSE_MIN_CYCLES && led.exposure_cycles <= SG_EXPOSE_MAX_CYCLES, "limits");
+        HOLDS(led.exposure_cycles >= SG_EXPOSE_MIN_CYCLES && led.exposure_cycles <= SG_EXPOSE_MAX_CYCLES,
+              "limits");
     }
 }
 

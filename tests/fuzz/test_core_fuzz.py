@@ -52,9 +52,12 @@ def test_random_and_damaged_bytes_break_no_invariant(program, seed):
 FAULTS = {
     "a decoder that trusts the code byte": (
         "sg_wire.c", "        if ((size_t)(code - 1U) > n - at)\n            return SG_E_SHORT;\n", ""),
-    "a decoder that trusts the length": ("sg_wire.c", "frame[at] == 0 || fill == SG_WIRE_PACKET_MAX", "frame[at] == 0"),
-    "a model opened without its length": ("sg_model.c", "    if (length > room)\n        return SG_E_SHORT;\n", ""),
-    "a receiver that never forgets": ("sg_link.c", "    rx->fill = 0;\n", "    rx->fill = fill > 71 ? 72 : 0;\n"),
+    "a decoder that trusts the length": ("sg_wire.c", "frame[at] == 0 || fill == SG_WIRE_PACKET_MAX",
+                                         "frame[at] == 0"),
+    "a model opened without its length": ("sg_model.c",
+                                          "    if (length > room)\n        return SG_E_SHORT;\n", ""),
+    "a receiver that never forgets": ("sg_link.c", "    rx->fill = 0;\n",
+                                      "    rx->fill = fill > 71 ? 72 : 0;\n"),
 }
 
 
@@ -67,4 +70,5 @@ def test_the_fuzzer_finds_a_planted_fault(fault, tmp_path):
     assert text.count(right) == 1
     (core / name).write_text(text.replace(right, wrong), encoding="utf-8")
     code, _, err = run(build(tmp_path, core), 1, "3000")
-    assert code != 0 and ("ERROR: AddressSanitizer" in err or "broken invariant" in err or "runtime error" in err)
+    assert code != 0 and ("ERROR: AddressSanitizer" in err or "broken invariant" in err
+                          or "runtime error" in err)

@@ -44,7 +44,8 @@ class Parts:
         head = ffi.new("struct sg_model_head *")
         head.magic, head.version, head.vectors, head.channels = lib.SG_MODEL_MAGIC, 1, n, d
         head.generation, head.length = self.generation, 256 + 13 * n
-        head.weight_frac_bits, head.guards, head.bias = self.weight_frac_bits, len(self.guard), list(self.bias)
+        head.weight_frac_bits, head.guards = self.weight_frac_bits, len(self.guard)
+        head.bias = [int(v) for v in self.bias]
         for j in range(d):
             head.offset[j], head.gain_q12[j] = int(self.offset[j]), int(self.gain_q12[j])
             for i in range(2):
@@ -92,12 +93,13 @@ def scaled(parts, feature):
 
 
 def twin(parts, feature):
-    """The device's answer: deg_q7 int64 [count, 2] before saturation, flagged bool [count] without saturation."""
+    """The device's answer before it saturates: deg_q7 int64 [count, 2], flagged bool [count]."""
     s, outside = scaled(parts, feature)
     for low, high, row in parts.guard:
         projection = s @ np.asarray(row, np.int64)
         outside |= (projection < low) | (projection > high)
-    t = np.maximum(((s * s).sum(axis=1) >> 5)[:, None] + parts.half_c2 - s @ parts.centre.T.astype(np.int64), 0)
+    s2 = (s * s).sum(axis=1) >> 5
+    t = np.maximum(s2[:, None] + parts.half_c2 - s @ parts.centre.T.astype(np.int64), 0)
     i = np.minimum(t >> 10, 1023)
     k = LEVEL[i] - ((((LEVEL[i] - LEVEL[i + 1]) << 6) * (t & 1023)) >> 16)
     k[t >= 1 << 20] = 0

@@ -63,7 +63,8 @@ def test_every_code_and_exposure_within_a_thousandth_of_an_octave():
 
 
 def test_feature_units_at_62_5_pa_and_one_octave_up():
-    for na, expected in ((62.5, 4096 * np.log2(1000)), (125.0, 4096 * np.log2(2000)), (500.0, 4096 * np.log2(8000))):
+    for na, units in ((62.5, 1000), (125.0, 2000), (500.0, 8000)):
+        expected = 4096 * np.log2(units)
         code = sampled_code(na, MAX)
         got, _ = feature(code, MAX)
         lsb = abs(true_feature(code, MAX) - true_feature(code - 1, MAX))
@@ -121,7 +122,7 @@ def test_quarter_microseconds_convert_exactly_and_clip():
 
 
 class Led:
-    """One LED under automatic exposure; `lag` frames pass between a correction and the exposure it changes."""
+    """One LED under automatic exposure; `lag` frames pass from a correction to the exposure it changes."""
 
     def __init__(self, start=START, lag=0):
         self.state = ffi.new("struct sg_expose_led *")
@@ -164,7 +165,8 @@ def test_converges_from_any_start_within_a_few_frames_from_dark_to_sun(start, cu
     assert exposure == pytest.approx(np.clip(wanted, MIN, MAX), rel=0.09)
 
 
-@pytest.mark.parametrize("before,after", [(0, 2600), (75, 2600), (150, 690), (2600, 75), (2600, 0), (600, 40)])
+@pytest.mark.parametrize("before,after", [(0, 2600), (75, 2600), (150, 690), (2600, 75), (2600, 0),
+                                          (600, 40)])
 def test_a_step_of_light_is_followed_with_the_stated_patience(before, after):
     led = Led()
     led.run(before, 20)

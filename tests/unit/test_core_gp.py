@@ -67,7 +67,8 @@ def test_every_pair_of_extreme_features_and_parameters():
 @pytest.mark.parametrize("half_c2", [0, 8 * 6 * 255 ** 2, 2 ** 22 - 1])
 def test_distance_at_both_ends_of_24_bits(centre, s, half_c2):
     parts = Parts(offset=np.zeros(6, int), gain_q12=np.full(6, 4096), bias=np.zeros(2, int),
-                  trend=np.zeros((2, 6), int), centre=np.full((3, 6), centre), weight=np.array([[32767, -32768]] * 3),
+                  trend=np.zeros((2, 6), int), centre=np.full((3, 6), centre),
+                  weight=np.array([[32767, -32768]] * 3),
                   half_c2=np.full(3, half_c2))
     agree(parts, np.full((1, 6), s, np.uint16))
 
@@ -76,14 +77,16 @@ def test_distance_zero_and_last_table_entry_and_first_zero_kernel():
     # One channel, centre 0: T = (s^2 >> 5) + half_c2 walks over 0, 2^20 - 1, 2^20.
     for t in (0, 1, 1023, 1024, 2 ** 20 - 1024, 2 ** 20 - 1, 2 ** 20, 2 ** 20 + 1):
         parts = Parts(offset=np.zeros(1, int), gain_q12=np.full(1, 4096), bias=np.zeros(2, int),
-                      trend=np.zeros((2, 1), int), centre=np.zeros((1, 1), int), weight=np.array([[32767, 1]]),
+                      trend=np.zeros((2, 1), int), centre=np.zeros((1, 1), int),
+                      weight=np.array([[32767, 1]]),
                       weight_frac_bits=6, half_c2=np.array([t]))
         agree(parts, np.zeros((1, 6), np.uint16))
 
 
 def test_kernel_falls_monotonically_without_a_step_up():
     parts = Parts(offset=np.zeros(1, int), gain_q12=np.full(1, 256), bias=np.zeros(2, int),
-                  trend=np.zeros((2, 1), int), centre=np.zeros((1, 1), int), weight=np.array([[32767, -32768]]),
+                  trend=np.zeros((2, 1), int), centre=np.zeros((1, 1), int),
+                  weight=np.array([[32767, -32768]]),
                   weight_frac_bits=6)
     feature = np.zeros((8192, 6), np.uint16)
     feature[:, 0] = np.arange(8192) * 8
@@ -97,14 +100,16 @@ def test_rounds_half_up_at_both_signs():
         half = 1 << (frac + 8)
         for bias, expected in ((half, 1), (half - 1, 0), (-half, 0), (-half - 1, -1), (0, 0)):
             parts = Parts(offset=np.zeros(1, int), gain_q12=np.ones(1, int), bias=np.array([bias, -bias]),
-                          trend=np.zeros((2, 1), int), centre=np.zeros((1, 1), int), weight=np.zeros((1, 2), int),
+                          trend=np.zeros((2, 1), int), centre=np.zeros((1, 1), int),
+                          weight=np.zeros((1, 2), int),
                           weight_frac_bits=frac)
             deg = agree(parts, np.zeros((1, 6), np.uint16))
             assert deg[0, 0] == expected
 
 
 def test_saturates_at_both_ends_and_says_so():
-    for bias, expected in ((2 ** 31 - 1, 32767), (-2 ** 31, -32768), (32767 << 15, 32767), (-32768 << 15, -32768)):
+    for bias, expected in ((2 ** 31 - 1, 32767), (-2 ** 31, -32768), (32767 << 15, 32767),
+                           (-32768 << 15, -32768)):
         parts = Parts(offset=np.zeros(1, int), gain_q12=np.ones(1, int), bias=np.array([bias, 0]),
                       trend=np.zeros((2, 1), int), centre=np.zeros((1, 1), int), weight=np.zeros((1, 2), int),
                       weight_frac_bits=6)
@@ -162,7 +167,7 @@ def test_guard_rows_hold_at_their_limits_and_fail_one_step_beyond():
 
 
 class FrozenDraws:
-    """integers() of numpy's Generator out of SHAKE-256, so that no library version moves the golden vectors."""
+    """integers() of numpy's Generator from SHAKE-256: no library version moves the golden vectors."""
 
     def __init__(self, seed):
         self.bytes, self.at = hashlib.shake_256(bytes([seed])).digest(1 << 16), 0
@@ -175,8 +180,8 @@ class FrozenDraws:
 
 
 def golden_case():
-    """The fixed model and its 64 features: 48 at growing distances around a vector each, 16 anywhere. The guards
-    are tight enough that each of them decides about some."""
+    """The fixed model and its 64 features: 48 at growing distances around a vector each, 16 anywhere. The
+    guards are tight enough that each of them decides about some."""
     draws = FrozenDraws(20)
     parts = random_parts(draws, 64)
     limits = ((0, 500000), (-200000, 200000), (-600000, 0))
@@ -192,7 +197,8 @@ def golden_crc(core_ffi=ffi, core_lib=lib):
     image = core_ffi.new("uint8_t[]", parts.image())
     view, out = core_ffi.new("struct sg_model_view *"), core_ffi.new("struct sg_gaze[64]")
     assert core_lib.sg_model_open(view, image, len(image), 0) == 0
-    core_lib.sg_batch_infer(view, core_ffi.from_buffer("uint16_t[]", np.ascontiguousarray(feature)), core_ffi.NULL,
+    core_lib.sg_batch_infer(view, core_ffi.from_buffer("uint16_t[]", np.ascontiguousarray(feature)),
+                            core_ffi.NULL,
                             core_ffi.new("int16_t[2]"), out, 64)
     return zlib.crc32(bytes(core_ffi.buffer(out)))
 

@@ -46,9 +46,13 @@ BREACHES = {
     "a remainder": ("core/sg_gp.c", "static inline int x(int a, int b) { return a % b; }", "division"),
     "a global": ("core/sg_link.c", "uint16_t frames = 0;", "global"),
     "a file static": ("core/sg_link.c", "static struct sg_link_rx rx;", "global"),
-    "a function static": ("core/sg_link.c", "static inline void x(void)\n{\n    static uint8_t n;\n    n++;\n}", "static variable"),
-    "direct recursion": ("core/sg_gp.c", "static int down(int n)\n{\n    return n ? down(n - 1) : 0;\n}", "recursive"),
-    "mutual recursion": ("core/sg_gp.c", "static int a1(int n);\nstatic int b1(int n)\n{\n    return a1(n);\n}\n"
+    "a function static": ("core/sg_link.c",
+                          "static inline void x(void)\n{\n    static uint8_t n;\n    n++;\n}",
+                          "static variable"),
+    "direct recursion": ("core/sg_gp.c", "static int down(int n)\n{\n    return n ? down(n - 1) : 0;\n}",
+                         "recursive"),
+    "mutual recursion": ("core/sg_gp.c",
+                         "static int a1(int n);\nstatic int b1(int n)\n{\n    return a1(n);\n}\n"
                          "static int a1(int n)\n{\n    return b1(n);\n}", "recursive"),
     "an unknown module": ("core/sg_utils.c", "", "not a module"),
     "hardware in the application": ("app/main.c", "#include <avr/io.h>", "the application may not"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One layout everywhere: hashes per version, sizes on the host and on AVR, tables as their script makes them."""
+"""One layout everywhere: hashes per version, sizes on host and AVR, tables as their script makes them."""
 import hashlib
 import re
 import subprocess
@@ -11,13 +11,14 @@ import core_avr_harness as avr
 from sparsegaze import _core_build
 from sparsegaze._core import ffi, lib
 
-# A changed hash under an old version number means that two programs of the same version would not understand each
-# other: raise SG_WIRE_VERSION or SG_MODEL_VERSION in the header and add the line.
+# A changed hash under an old version number means that two programs of the same version would not understand
+# each other: raise SG_WIRE_VERSION or SG_MODEL_VERSION in the header and add the line.
 WIRE_LAYOUT = {1: "b7f58fadb493ef0c"}
 MODEL_LAYOUT = {1: "8170e606b7f66b46"}
 
-STRUCTS = ("sg_head", "sg_hello", "sg_status", "sg_ping", "sg_pong", "sg_mode", "sg_infer", "sg_gaze", "sg_raw",
-           "sg_counts", "sg_model_info", "sg_model_at", "sg_model_data", "sg_model_verdict", "sg_exposure",
+STRUCTS = ("sg_head", "sg_hello", "sg_status", "sg_ping", "sg_pong", "sg_mode", "sg_infer", "sg_gaze",
+           "sg_raw", "sg_counts", "sg_model_info", "sg_model_at", "sg_model_data", "sg_model_verdict",
+           "sg_exposure",
            "sg_recentre", "sg_error", "sg_model_head", "sg_model_guard", "sg_link_rx", "sg_expose_led")
 
 
@@ -72,18 +73,19 @@ def test_sizes_and_offsets_are_equal_on_avr(tmp_path):
         expected.append(getattr(lib, name) & 0xFFFFFFFF)
     source = tmp_path / "sizes.c"
     source.write_text("".join(f'#include "{h}"\n' for h in _core_build.HEADERS) +
-                      'const uint32_t sizes[] __attribute__((section(".sizes"))) = {\n' + ",\n".join(lines) + "};\n",
-                      encoding="utf-8")
+                      'const uint32_t sizes[] __attribute__((section(".sizes"))) = {\n' + ",\n".join(lines) +
+                      "};\n", encoding="utf-8")
     avr.run([avr.avr_tool("avr-gcc"), *avr.AVR_FLAGS, "-c", source, "-o", tmp_path / "sizes.o"])
-    avr.run([avr.avr_tool("avr-objcopy"), "-O", "binary", "-j", ".sizes", tmp_path / "sizes.o", tmp_path / "sizes"])
+    avr.run([avr.avr_tool("avr-objcopy"), "-O", "binary", "-j", ".sizes", tmp_path / "sizes.o",
+             tmp_path / "sizes"])
     raw = (tmp_path / "sizes").read_bytes()
     got = [int.from_bytes(raw[i:i + 4], "little") for i in range(0, len(raw), 4)]
     assert got == expected
 
 
 def test_tables_are_what_their_script_makes():
-    done = subprocess.run([sys.executable, avr.CORE / "make_tables.py", "--check"], capture_output=True, text=True,
-                          check=False)
+    done = subprocess.run([sys.executable, avr.CORE / "make_tables.py", "--check"], capture_output=True,
+                          text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 

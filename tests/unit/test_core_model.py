@@ -108,7 +108,8 @@ def test_a_length_that_does_not_fit_the_vectors_is_refused(length):
 
 
 @pytest.mark.parametrize("name,values", [
-    ("channels", (0, 7, 255)), ("kernel", (1, 255)), ("weight_frac_bits", (0, 5, 11, 255)), ("guards", (9, 255)),
+    ("channels", (0, 7, 255)), ("kernel", (1, 255)), ("weight_frac_bits", (0, 5, 11, 255)),
+    ("guards", (9, 255)),
     ("reserved", (1, 128))])
 def test_a_head_field_outside_its_range_is_refused_under_a_good_crc(name, values):
     for value in values:
@@ -151,7 +152,8 @@ def test_guard_limits_are_compared_as_signed():
     data = image(guards=1)
 
     def with_limits(low, high):
-        return changed(data, 128, *low.to_bytes(4, "little", signed=True), *high.to_bytes(4, "little", signed=True))
+        limits = low.to_bytes(4, "little", signed=True) + high.to_bytes(4, "little", signed=True)
+        return changed(data, 128, *limits)
 
     for low, high in ((-1, 0), (-2 ** 31, 2 ** 31 - 1), (5, 5), (-6, -5)):
         assert verdict(with_limits(low, high)) == lib.SG_OK

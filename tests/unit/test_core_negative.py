@@ -13,7 +13,8 @@ from test_core_gp import GOLDEN_CRC, golden_crc
 
 FAULTS = {
     "the shift of the interpolated drop": ("sg_gp_loop.c", "fraction_q10) >> 16)", "fraction_q10) >> 15)"),
-    "the sign of a weight": ("sg_gp_loop.c", "sum->acc[1] = acc_elevation;", "sum->acc[1] = 0U - acc_elevation;"),
+    "the sign of a weight": ("sg_gp_loop.c", "sum->acc[1] = acc_elevation;",
+                             "sum->acc[1] = 0U - acc_elevation;"),
     "the kernel's end": ("sg_gp_loop.c", "t >= 0x100000UL", "t >= 0x080000UL"),
     "the scale of S2": ("sg_gp.c", "sum_s2 >> 5", "sum_s2 >> 4"),
     "the rounding": ("sg_q.h", "((x >> (bits - 1U)) + 1) >> 1", "x >> bits"),

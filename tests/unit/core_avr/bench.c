@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The core on an ATmega328P, without a port: reads its case from flash, marks what it does in GPIOR0 (2k+1 begin,
-// 2k+2 end of section k), writes every result to GPIOR1 byte by byte and stops.
+// The core on an ATmega328P, without a port: reads its case from flash, marks what it does in GPIOR0 (2k+1
+// begin, 2k+2 end of section k), writes every result to GPIOR1 byte by byte and stops.
 //
 // case_data.h is made by tests/unit/core_avr_harness.py: image, features, codes, exposures.
 #include <avr/interrupt.h>
