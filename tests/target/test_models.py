@@ -186,3 +186,22 @@ def test_model_images_are_exactly_what_was_stored(board):
     model = random_model(216)
     _, device = board(models={0: model.image})
     assert DeviceModel(device.read_model(0)).image == model.image
+
+
+@pytest.mark.parametrize("after_ms", [0.5, 3, 9, 21, 40, 55, 70, 85, 100, 130])
+def test_power_cut_while_the_offset_is_written_leaves_the_old_or_the_new(board, after_ms):
+    model = random_model(20)
+    nano, device = board(models={0: model.image})
+    device.link.sleep(0.5)
+    device.recentre((1.25, 2.5))
+    device.link.sleep(0.5)
+    device.recentre((-3.0, 4.75))
+    nano.control.cut(nano.control.time().cycle + int(after_ms * 16000))
+    device.link.sleep(after_ms * 1e-3 - 0.0001)
+    nano.control.command("time")
+    nano.control.power(False)
+    nano.control.power(True)
+    device.connect()
+    now = device.recentre()
+    assert (now.azimuth_deg, now.elevation_deg) in ((1.25, 2.5), (-3.0, 4.75))
+    assert device.status().boot_count == 2

@@ -30,7 +30,11 @@ void boot_first(void)
                      "sts %0+1, r10" "\n\t"
                      "sts %0+2, r11" "\n\t"
                      "sts %0+3, r14" "\n\t"
-                     "sts %0+4, r15" : : "i"(&left));
+                     "sts %0+4, r15" "\n\t"
+                     "clr r10" "\n\t"         // seen: they shall not be taken for the bootloader's again
+                     "clr r11" "\n\t"
+                     "clr r14" "\n\t"
+                     "clr r15" : : "i"(&left));
     left_mcusr = MCUSR;
     MCUSR = 0;
     __asm__ volatile("wdr");

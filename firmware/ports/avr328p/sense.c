@@ -22,7 +22,7 @@ enum {
     RELEASE_READ_CYCLES = 1,
     EXPOSURE_FIXED_CYCLES = SAMPLE_CYCLES + RELEASE_READ_CYCLES,
     LIGHTS_OUT_MARGIN_CYCLES = 8,
-    SETTLE_CYCLES = 5 * CYCLES_PER_US - 42,     // 42: from the light to the release without the delay
+    SETTLE_CYCLES = 5 * CYCLES_PER_US - 34,     // 34: from the light to the release without the delay
     LATE_CYCLES = 40 * CYCLES_PER_US,
     SOON_CYCLES = 64,               // a compare value nearer than this may be missed
     ADC_ON = (1 << ADEN) | (1 << ADPS2) | (1 << ADPS1) | (1 << ADPS0),
@@ -210,34 +210,34 @@ uint32_t hal_now_us(void)
 
 uint8_t sense_take(struct hal_frame *frame)
 {
-    uint32_t start_overflows;
-    uint16_t first, last = 0, sum_half_cycles = 0;
+    uint8_t which;
+    uint16_t last = 0;
     uint32_t sum_cycles = 0;
 
-    if (!ready)
-        return 0;
-    HAL_BEGIN(HAL_SECTION_FRAME);
-    ATOMIC_BLOCK(ATOMIC_FORCEON) {      // ~15 us: within what the UART's two-byte buffer bridges at 1 Mbaud
-        const struct raw_frame *raw = &buffer[ready - 1];
-        first = raw->slot[0].release;
-        for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-            frame->code[i] = raw->slot[i].code;
-            frame->exposure_cycles[i] = raw->slot[i].exposure_cycles;
-            last = raw->slot[i].release - first;
-            sum_cycles += last;
-        }
-        start_overflows = raw->overflows;
-        frame->seq = raw->seq;
+    ATOMIC_BLOCK(ATOMIC_FORCEON) {
+        which = ready;
         ready = 0;
     }
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        sum_half_cycles += frame->exposure_cycles[i] >> 1;
+    if (!which)
+        return 0;
+    HAL_BEGIN(HAL_SECTION_FRAME);
+    // Read without a lock: should the other buffer become complete meanwhile, the engine comes back to this one with
+    // the next release, 100 us later at the earliest.
+    const struct raw_frame *raw = &buffer[which - 1];
+    const uint16_t first = raw->slot[0].release;
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+        const uint16_t exposure_cycles = raw->slot[i].exposure_cycles;
+        frame->code[i] = raw->slot[i].code;
+        frame->exposure_cycles[i] = exposure_cycles;
+        last = raw->slot[i].release - first;
+        sum_cycles += last + (exposure_cycles >> 1);
+    }
     last += frame->exposure_cycles[HAL_CHANNELS - 1];
-    sum_cycles += sum_half_cycles;
+    frame->seq = raw->seq;
     // sum / 6, as (sum / 2) * 21846 / 2^16: at most two cycles too much for frames below 3600 us, and 32 bits
     // hold it.
     const uint16_t mean = (uint16_t)(((sum_cycles >> 1) * 21846UL) >> 16);
-    const uint32_t first_us = (start_overflows << 12) | (first >> 4);
+    const uint32_t first_us = (raw->overflows << 12) | (first >> 4);
     frame->t_us = first_us + ((mean + (first & 15U) + 8U) >> 4);
     frame->span_us = (uint16_t)(last - mean + 8U) >> 4;
     return 1;
