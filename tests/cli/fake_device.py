@@ -20,16 +20,25 @@ MIDDLE = 30000
 Pong = namedtuple("Pong", "rx_us tx_us")
 
 
-def linear_model(generation=1):
-    """The DeviceModel that inverts OPTICS."""
-    # s = (feature - offset) / 2;  gaze = pinv(OPTICS) (feature - MIDDLE)
-    inverse = np.linalg.pinv(OPTICS)
+def linear_model(generation=1, inverse=None, n_vectors=64):
+    """The DeviceModel of gaze = inverse (feature - MIDDLE); inverse [2, 6] deg per step, default that of OPTICS."""
+    # s = (feature - offset) / 2
+    inverse = np.linalg.pinv(OPTICS) if inverse is None else inverse
     unit = 2.0 ** -24
     offset = MIDDLE - 4095
     trend = np.round(2 * inverse / unit).astype(np.int64)
     bias = np.round(inverse @ np.full(6, offset - MIDDLE) / unit).astype(np.int64)
-    return DeviceModel.from_parts(np.full(6, offset), np.full(6, 2048), bias, trend, np.zeros((64, 6), np.int64),
-                                  np.zeros((64, 2), np.int64), 8, generation=generation)
+    return DeviceModel.from_parts(np.full(6, offset), np.full(6, 2048), bias, trend, np.zeros((n_vectors, 6), np.int64),
+                                  np.zeros((n_vectors, 2), np.int64), 8, generation=generation)
+
+
+def fit_linear(recording, n_vectors=64):
+    """What distil.fit_recording does, for linear optics, at once."""
+    x = recording.features[recording.valid].astype(float) - MIDDLE
+    inverse = np.linalg.lstsq(x, recording.target_deg[recording.valid], rcond=1e-3)[0].T
+    miss = x @ inverse.T - recording.target_deg[recording.valid]
+    return SimpleNamespace(gp=None, model=linear_model(0, inverse, n_vectors),
+                           report={"loo_rms_deg": float(np.sqrt((miss ** 2).sum(axis=1).mean()))})
 
 
 class FakeScreen:
