@@ -59,7 +59,7 @@ def firmware(name, start=0, define=()):
     """Build tests/nano/firmware/NAME.c for the ATmega328P, linked at START; returns the ELF's path."""
     BUILD.mkdir(parents=True, exist_ok=True)
     tag = "".join("-" + re.sub(r"\W", "_", d) for d in define)
-    out = BUILD / f"{name}{tag}.elf"
+    out = BUILD / f"{name}-{start:x}{tag}.elf"
     source = SOURCES / f"{name}.c"
     newest = max(path.stat().st_mtime for path in (source, SOURCES / "bench.h"))
     if not out.exists() or out.stat().st_mtime < newest:
