@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The eye as an analytic surface of revolution, in its own frame: origin at the centre of rotation, +z out of the
-// cornea along the optical axis. Lengths in mm, angles in radians unless a name says otherwise.
+// The eye as an analytic surface of revolution, in its own frame: origin at the centre of rotation, +z out of
+// the cornea along the optical axis. Lengths in mm, angles in radians unless a name says otherwise.
 //
-// Seen from the centre of rotation the outside is a radius rho(theta), theta from the axis: the smooth maximum
-// (cubic, C2) of the corneal conic and the scleral globe. The smoothing is the limbus: without it there is no fold
-// in the surface's normals and no bright ring in the maps.
+// Seen from the centre of rotation the outside is a radius rho(theta), theta from the axis: the smooth
+// maximum (cubic, C2) of the corneal conic and the scleral globe. The smoothing is the limbus: without it
+// there is no fold in the surface's normals and no bright ring in the maps.
 #ifndef SIM_EYE_H
 #define SIM_EYE_H
 
@@ -42,21 +42,24 @@ struct sim_eye {
 
 void sim_eye_init(struct sim_eye *eye, const struct sim_person *person);
 
-// Radius from the centre of rotation and its derivative by theta, at polar angle with the given sine and cosine.
+// Radius from the centre of rotation and its derivative by theta, at polar angle with the given sine and
+// cosine.
 double sim_eye_rho(const struct sim_eye *eye, double sin_theta, double cos_theta, double *derivative);
 
 // How white the surface is at distance r from the axis: 0 clear cornea .. 1 sclera (C2).
 double sim_eye_whiteness(const struct sim_eye *eye, double r);
 
-// The eye's axes (columns, row-major 3 x 3) in the head frame when its visual axis points at the given Fick angles:
-// Listing's law, the rotation about the cross product of rest and gaze.
+// The eye's axes (columns, row-major 3 x 3) in the head frame when its visual axis points at the given Fick
+// angles: Listing's law, the rotation about the cross product of rest and gaze.
 void sim_eye_orient(const struct sim_eye *eye, double azimuth_deg, double elevation_deg, double axes[9]);
 
-// Light between an outside point and a point of the iris, through the cornea (Fermat's path, Newton's method).
+// Light between an outside point and a point of the iris, through the cornea (Fermat's path, Newton's
+// method).
 //   site, spot   eye frame; spot on the iris plane
 //   exit         receives where the path crosses the cornea
-// Returns transfer = cos(iris) * Fresnel transmission * (solid angle at the site per area across the ray at the
-// spot), in 1/mm^2: the irradiance of the iris per intensity of a source at the site. 0 when no path exists.
+// Returns transfer = cos(iris) * Fresnel transmission * (solid angle at the site per area across the ray at
+// the spot), in 1/mm^2: the irradiance of the iris per intensity of a source at the site. 0 when no path
+// exists.
 double sim_eye_refract(const struct sim_eye *eye, const double site[3], const double spot[3], double exit[3]);
 
 // Fresnel reflectance, unpolarised, from outside, at the given cosine of incidence.

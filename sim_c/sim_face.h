@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Face and closed lids as one height field w(x, y) = -z over the frontal plane (mm, head frame, origin at the centre
-// of rotation): the lids' bulge, orbit, brow, nose and cheek, smooth everywhere. What an open eye cuts out of it is
-// a soft mask that depends on the lids' pose; which of it each lamp or sensor reaches does not, and is found once,
-// with Embree.
+// Face and closed lids as one height field w(x, y) = -z over the frontal plane (mm, head frame, origin at the
+// centre of rotation): the lids' bulge, orbit, brow, nose and cheek, smooth everywhere. What an open eye cuts
+// out of it is a soft mask that depends on the lids' pose; which of it each lamp or sensor reaches does not,
+// and is found once, with Embree.
 #ifndef SIM_FACE_H
 #define SIM_FACE_H
 
@@ -29,8 +29,8 @@ struct sim_face {
 
 double sim_face_height(const struct sim_person *person, double x, double y);
 
-// Build the mesh and cast all rays. step_mm: spacing of the quadrature. radius_mm: of each site's lens, for soft edges.
-// Returns 0, or -1 with a reason. sim_face_close() in either case.
+// Build the mesh and cast all rays. step_mm: spacing of the quadrature. radius_mm: of each site's lens, for
+// soft edges. Returns 0, or -1 with a reason. sim_face_close() in either case.
 int sim_face_open(struct sim_face *face, const struct sim_person *person, const double (*sites)[3],
                   const double *radius_mm, int n_sites, double step_mm, char *error, size_t error_bytes);
 void sim_face_close(struct sim_face *face);

@@ -2,9 +2,9 @@
 //
 // The glint: light that the eye's front mirrors from an emitter into a sensor,
 //     integral of D(n.h) F(l.h) / 4 * beam / d_l^2 * window / d_v^2 over the surface,
-// D Beckmann's distribution. On a smooth surface with a compact smooth lobe the midpoint rule converges faster than any
-// power of its step, so one uniform rule over (theta, phi) serves everywhere, fold included: along the profile all of
-// it, around the axis only where the lobe is.
+// D Beckmann's distribution. On a smooth surface with a compact smooth lobe the midpoint rule converges
+// faster than any power of its step, so one uniform rule over (theta, phi) serves everywhere, fold included:
+// along the profile all of it, around the axis only where the lobe is.
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
@@ -26,7 +26,7 @@ struct pair_view {
     const struct sim_scene *scene;
     const double *axes, *a, *b;  // site positions, eye frame
     int site_a, site_b;
-    double alpha2;
+    double alpha2, nearest;  // of the lobe; distance from the apex's sphere to the nearer site
     const struct sim_lid *lids;
     int n_lids;
     double *out;
@@ -49,7 +49,8 @@ static void point_on(const struct ring *ring, double phi, double point[3], doubl
     normal[2] = ring->n_up;
 }
 
-// The azimuth at which the half vector lies in the ring's meridian plane, and the half vector's angle from the axis.
+// The azimuth at which the half vector lies in the ring's meridian plane, and the half vector's angle from
+// the axis.
 static double facing_azimuth(const struct pair_view *view, const struct ring *ring, double phi,
                              double *angle) {
     double h[3] = {0, 0, 1};
@@ -120,7 +121,8 @@ static void add_pair(const struct pair_view *view, const struct ring *rings, int
         double angle;
         phi = facing_azimuth(view, &rings[i], start, &angle);
         if (fabs(angle - rings[i].tilt) > 5 * alpha) continue;
-        // The half vector turns against the normal as phi grows, so the lobe is passed up to 1.6 times faster.
+        // The half vector turns against the normal as phi grows, so the lobe is passed up to 1.6 times
+        // faster.
         double sine = rings[i].n_out > 1e-9 ? rings[i].n_out : 1e-9;
         double reach = REACH_WIDTHS * alpha / sine, step = step_widths * alpha / (1.6 * sine);
         if (reach > PI) reach = PI;
@@ -151,7 +153,14 @@ int sim_scene_glint(const struct sim_scene *scene, double azimuth_deg, double el
         sim_lid_pose(&lids[i], &scene->person, elevation_deg, lid_opening[i]);
     }
     memset(out, 0, (size_t)(n_lids * scene->n_sensors * scene->n_emitters) * sizeof *out);
-    double step = scene->quality.glint_theta_deg * SIM_RADIANS, axes[9], sites[2 * SIM_MAX_PORTS][3];
+    double axes[9], sites[2 * SIM_MAX_PORTS][3], nearest = 1e9, away[2 * SIM_MAX_PORTS];
+    for (int k = 0; k < scene->n_sites; ++k) {
+        away[k] = sqrt(sim_dot(scene->sites[k].position, scene->sites[k].position)) - scene->eye.apex;
+        if (away[k] < nearest) nearest = away[k];
+    }
+    double step = scene->quality.glint_theta_deg * SIM_RADIANS;
+    if (nearest < scene->eye.apex) step *= nearest / scene->eye.apex;  // half vectors turn faster near a site
+    if (step < 2e-5) step = 2e-5;
     int n_rings = (int)ceil(THETA_END / step);
     struct ring *rings = malloc((size_t)n_rings * sizeof *rings);
     if (!rings) return -1;
@@ -190,6 +199,7 @@ int sim_scene_glint(const struct sim_scene *scene, double azimuth_deg, double el
                                      .site_a = a,
                                      .site_b = b,
                                      .alpha2 = rough * rough + widen[a] + widen[b],
+                                     .nearest = away[a] < away[b] ? away[a] : away[b],
                                      .lids = lids,
                                      .n_lids = n_lids,
                                      .out = out};

@@ -9,7 +9,8 @@
 
 #define SIM_RADIANS (3.14159265358979323846 / 180)
 
-// A place where at least one sensor or emitter is, head frame. Everything but the window depends on the place only.
+// A place where at least one sensor or emitter is, head frame. Everything but the window depends on the place
+// only.
 struct sim_site {
     double position[3], radius;
 };
@@ -30,14 +31,15 @@ struct sim_scene {
     double *nodes;  // Gauss-Legendre abscissas on -1..1 and weights: alpha, beta, iris ring, iris edge
     const double *gauss[4];
     double *face_all;    // [sensors][emitters] response of all skin with the lids closed
-    double *face_spots;  // [n_lid_spots][sensors + emitters] factors of each spot that an open eye may replace
+    double *face_spots;  // [n_lid_spots][sensors + emitters], of what an open eye may replace
     int *lid_spots, n_lid_spots;
 };
 
 // A window's weight for light arriving along the unit vector `away` (from the scene to the site).
 double sim_window_weight(const struct sim_window *window, const double away[3]);
 
-// out += weight * sensor_part (x) emitter_part, each already including its window; sites' factors given per site.
+// out += weight * sensor_part (x) emitter_part, each already including its window; sites' factors given per
+// site.
 void sim_add_pairs(const struct sim_scene *scene, double weight, const double *sensor_part,
                    const double *emitter_part, double *out);
 

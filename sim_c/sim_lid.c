@@ -55,7 +55,8 @@ double sim_lid_open_toward(const struct sim_lid *lid, const struct sim_lid_point
     double out = sim_dot(toward, point->radial), tangent = sim_dot(toward, point->up);
     if (out < 0.02) out = 0.02;
     tangent /= out;
-    // Positive part of the slope toward each margin, rounded so that it is smooth where the ray is along the normal.
+    // Positive part of the slope toward each margin, rounded so that it is smooth where the ray is along the
+    // normal.
     double size = sqrt(tangent * tangent + 0.01);
     double to_upper = lid->thickness * (size + tangent) / 2, to_lower = lid->thickness * (size - tangent) / 2;
     return sim_step((point->above - to_upper) / lid->softness) *

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The two lid margins, as curves around the centre of rotation: elevation beta over azimuth alpha of a direction in
-// the head frame (radians; e_r = (sin a cos b, sin b, -cos a cos b)). Inside both, the eye; outside, skin. Edges are
-// soft (C2), so that nothing that lids cut has a staircase; closed lids hide everything exactly.
+// The two lid margins, as curves around the centre of rotation: elevation beta over azimuth alpha of a
+// direction in the head frame (radians; e_r = (sin a cos b, sin b, -cos a cos b)). Inside both, the eye;
+// outside, skin. Edges are soft (C2), so that nothing that lids cut has a staircase; closed lids hide
+// everything exactly.
 #ifndef SIM_LID_H
 #define SIM_LID_H
 
@@ -25,8 +26,8 @@ void sim_lid_pose(struct sim_lid *lid, const struct sim_person *person, double e
 // Both margins at one azimuth.
 void sim_lid_margins(const struct sim_lid *lid, double alpha, double *upper, double *lower);
 
-// Unit vectors of a point given in the head frame relative to the centre of rotation; no margin distances yet.
-// Returns its distance from the centre.
+// Unit vectors of a point given in the head frame relative to the centre of rotation; no margin distances
+// yet. Returns its distance from the centre.
 double sim_lid_locate(const double head[3], struct sim_lid_point *point, double *alpha, double *beta);
 
 // Distances to the margins of one pose.

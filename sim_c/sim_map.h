@@ -63,7 +63,8 @@ int sim_map_emitters(const struct sim_map *map);
 // for 36 pairs.
 int sim_map_eval(const struct sim_map *map, const struct sim_state *state, double *out);
 
-// The same for n states in a row: out[n][sensors][emitters]. Returns the number of states that were not finite.
+// The same for n states in a row: out[n][sensors][emitters]. Returns the number of states that were not
+// finite.
 int sim_map_eval_many(const struct sim_map *map, const struct sim_state *states, size_t n, double *out);
 
 // The same as two terms whose sum is the response; either pointer may be NULL. Not clamped at zero.

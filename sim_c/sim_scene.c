@@ -11,8 +11,8 @@
 struct sim_quality sim_quality_default(void) {
     struct sim_quality q = {.lid_alpha = 80,
                             .lid_beta = 64,
-                            .iris_ring = 4,
-                            .iris_edge = 10,
+                            .iris_ring = 3,
+                            .iris_edge = 14,
                             .iris_phi = 64,
                             .glint_theta_deg = 0.5,
                             .glint_lobe = 1.0,
@@ -203,8 +203,8 @@ static void add_iris_spot(const struct sim_scene *scene, const double axes[9], c
     }
 }
 
-// Rings between successive pupil edges and from the last to the limbus, summed from outside in: the iris of a small
-// pupil is that of the next larger one plus a ring.
+// Rings between successive pupil edges and from the last to the limbus, summed from outside in: the iris of a
+// small pupil is that of the next larger one plus a ring.
 static int add_iris(const struct sim_scene *scene, const double axes[9], double elevation_deg,
                     const double *pupil_mm, int n_pupils, const double *lid_opening, int n_lids,
                     double *out) {
@@ -231,7 +231,7 @@ static int add_iris(const struct sim_scene *scene, const double axes[9], double 
             for (int j = 0; j < q->iris_phi; ++j) {
                 double phi = 2 * PI * (j + 0.5) / q->iris_phi;
                 double spot[3] = {r * cos(phi), r * sin(phi), eye->iris_z};
-                add_iris_spot(scene, axes, (const double(*)[3])sites_eye, spot, weight, lids, n_lids, ring);
+                add_iris_spot(scene, axes, (const double (*)[3])sites_eye, spot, weight, lids, n_lids, ring);
             }
         }
         for (int k = 0; k < block; ++k) out[(size_t)p * (size_t)block + (size_t)k] += ring[k];
@@ -333,9 +333,9 @@ static int check_port(const struct sim_scene *scene, const double at[3], const s
     else if (!(size > 0)) why = "has no aim";
     else if (!(port->sigma_deg > 0 && port->sigma_deg <= 85))
         why = "has an angular sigma outside 0..85 degrees";
-    else if (!(port->radius_mm >= 0 && port->radius_mm < distance / 4)) why = "has an impossible radius";
     else if (distance < nearest + 0.2) why = "is inside the eyeball or touches it at some gaze";
     else if (-at[2] < sim_face_height(p, at[0], at[1]) + 0.2) why = "is inside or behind the face";
+    else if (!(port->radius_mm >= 0 && port->radius_mm < distance / 4)) why = "has an impossible radius";
     if (!why) return 0;
     snprintf(text, sizeof text, "%s %d %s", what, number, why);
     return refuse(error, bytes, text);

@@ -2,17 +2,19 @@
 //
 // One headset on one person: the response of every (sensor, emitter) pair to gaze, pupil and lids.
 //
-// Frame     head frame = OpenXR's axes (+x right, +y up, -z forward), origin at the eye's centre of rotation, right
-//           eye: +x is temporal. Straight ahead the eye looks along -z and its corneal apex lies near z = -13 mm; the
-//           headset is in front of it, at negative z. Ports are given in the headset's frame, whose origin is where a
-//           nominal person's centre of rotation is; person.eye_position_mm and slip move the two against each other.
+// Frame     head frame = OpenXR's axes (+x right, +y up, -z forward), origin at the eye's centre of rotation,
+//           right eye: +x is temporal. Straight ahead the eye looks along -z and its corneal apex lies near z
+//           = -13 mm; the headset is in front of it, at negative z. Ports are given in the headset's frame,
+//           whose origin is where a nominal person's centre of rotation is; person.eye_position_mm and slip
+//           move the two against each other.
 // Response  irradiance-like: integral over the scene of
 //               emitter beam / distance^2 * reflection * sensor window / distance^2,
 //           per unit axial intensity of the emitter, 1/mm^2. A window is exp(-tan^2(angle)/(2 tan^2 sigma)).
-//           One reflection only; skin, sclera and iris Lambertian; pupil black; the eye's front has a Beckmann glint
-//           whose width is the tear film's roughness and both lenses' radii (a disc of radius r at distance d widens
-//           the lobe of half vectors by r / (2 d)).
-// Left out  interreflection, lashes, the pupil's retro-reflection, the pupil's decentration, posterior cornea and lens.
+//           One reflection only; skin, sclera and iris Lambertian; pupil black; the eye's front has a
+//           Beckmann glint whose width is the tear film's roughness and both lenses' radii (a disc of radius
+//           r at distance d widens the lobe of half vectors by r / (2 d)).
+// Left out  interreflection, lashes, the pupil's retro-reflection, the pupil's decentration, posterior cornea
+// and lens.
 #ifndef SIM_SCENE_H
 #define SIM_SCENE_H
 
@@ -49,7 +51,8 @@ struct sim_quality sim_quality_default(void);
 
 // Check and prepare a scene: casts the face's visibility rays (about 0.1 s), nothing else does later.
 //   slip_mm   added to every port's position; NULL = none.
-//   error     receives one line when the scene is impossible: a port inside the eye or the face, a number that is not
+//   error     receives one line when the scene is impossible: a port inside the eye or the face, a number
+//             that is not
 //             finite or out of any anatomy's range.
 // Returns the scene, or NULL.
 struct sim_scene *sim_scene_open(const struct sim_person *person, const struct sim_port *sensors,

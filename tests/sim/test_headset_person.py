@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenes as data: what is read, what is drawn, and what is refused with its reason."""
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sim_scenes import pair, port
+
+from sparsegaze.errors import SceneError
+from sparsegaze.headset import load_headset
+from sparsegaze.person import Person, draw_person, load_person
+from sparsegaze.scene import Scene
+
+LED = """
+[[led]]
+position_mm = [16.0, 0.0, -28.0]
+aim_mm = [0.0, 0.0, -11.0]
+sensitivity_sigma_deg = 10.0
+lens_radius_mm = 1.5
+"""
+
+
+def write(tmp_path, text):
+    path = tmp_path / "it.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_the_default_headset_is_six_leds_that_all_sense_and_emit(led2gaze):
+    assert len(led2gaze.sensors) == len(led2gaze.emitters) == 6
+    assert led2gaze.sensors == led2gaze.emitters
+
+
+def test_the_default_headset_leaves_the_view_free_and_keeps_its_distance(led2gaze):
+    apex = np.array([0, 0, -13.1])
+    for led in led2gaze.sensors:
+        away = np.array(led.position_mm) - apex
+        distance = np.linalg.norm(away)
+        assert 18 <= distance <= 30
+        assert np.degrees(np.arccos(-away[2] / distance)) > 25
+        assert led.position_mm[1] < 3, "not above the eye: lashes"
+        assert 8 <= led.sigma_deg <= 12
+
+
+def test_the_default_headset_names_each_leds_pins_once(led2gaze):
+    pins = [entry["anode_pin"] for entry in led2gaze.wiring.values()]
+    pins += [entry["cathode_pin"] for entry in led2gaze.wiring.values()]
+    assert sorted(pins) == ["A0", "A1", "A2", "A3", "A4", "A5", "D2", "D3", "D4", "D5", "D6", "D7"]
+
+
+def test_sensors_and_emitters_may_be_separate(tmp_path):
+    text = LED.replace("[[led]]", "[[sensor]]") + LED.replace("[[led]]", "[[emitter]]").replace(
+        "sensitivity_sigma_deg", "beam_sigma_deg") * 2
+    headset = load_headset(write(tmp_path, text))
+    assert (len(headset.sensors), len(headset.emitters)) == (1, 2)
+    assert Scene(headset, Person()).response(0, 0).shape == (1, 2)
+
+
+@pytest.mark.parametrize("text, says", [
+    ("", "0 sensors"),
+    ("led = 3", "[[led]]"),
+    ("[[led]]\n", "position_mm"),
+    ("[[led", "it.toml"),
+    (LED.replace("16.0, 0.0", "16.0"), "position_mm"),
+    (LED.replace("16.0", "nan"), "position_mm"),
+    (LED.replace("16.0", "inf"), "position_mm"),
+    (LED.replace("16.0", "true"), "position_mm"),
+    (LED.replace("16.0", '"16"'), "position_mm"),
+    (LED.replace("[16.0, 0.0, -28.0]", "[0.0, 0.0, -11.0]"), "aim_mm"),
+    (LED.replace("= 10.0", "= 0.0"), "sensitivity_sigma_deg"),
+    (LED.replace("= 10.0", "= nan"), "sensitivity_sigma_deg"),
+    (LED.replace("= 1.5", "= -1.5"), "lens_radius_mm"),
+    (LED.replace("lens_radius_mm = 1.5", ""), "lens_radius_mm"),
+    (LED * 33, "33"),
+])
+def test_a_malformed_headset_is_refused_naming_the_entry(tmp_path, text, says):
+    with pytest.raises(SceneError) as caught:
+        load_headset(write(tmp_path, text))
+    assert says in str(caught.value)
+
+
+def test_a_missing_headset_file_is_refused(tmp_path):
+    with pytest.raises(SceneError):
+        load_headset(str(tmp_path / "none.toml"))
+
+
+def scene_refusal(sensor, person=Person()):
+    with pytest.raises(SceneError) as caught:
+        Scene(pair(sensor, port((10, -10, -30))), person)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("position", [(0, 0, -1), (3, 2, -8), (0, 0, -13.0), (9, 0, -9)])
+def test_a_sensor_inside_the_eyeball_is_refused(position):
+    assert "sensor 0 is inside the eyeball" in scene_refusal(port(position, (0, 0, -50)))
+
+
+@pytest.mark.parametrize("position", [(0, 0, 30), (0, 22, -8), (-25, 0, -10), (20, -20, 5)])
+def test_a_sensor_inside_or_behind_the_face_is_refused(position):
+    assert "face" in scene_refusal(port(position))
+
+
+def test_a_sensor_behind_the_face_only_after_slip_is_refused():
+    headset = pair(port((0, -12, -14)), port((10, -10, -30)))
+    Scene(headset, Person())
+    with pytest.raises(SceneError):
+        Scene(headset, Person(), slip_mm=(0, 0, 9))
+
+
+@pytest.mark.parametrize("change", [
+    {"cornea_radius_mm": float("nan")}, {"cornea_radius_mm": 5.0}, {"globe_radius_mm": 5.0},
+    {"cornea_asphericity": 3.0}, {"iris_depth_mm": 1.0}, {"iris_depth_mm": 20.0}, {"albedo_skin": 1.2},
+    {"albedo_iris": -0.1}, {"roughness": 0.0}, {"refractive_index": 1.0}, {"lid_upper_deg": -40.0},
+    {"canthus_deg": 0.0}, {"lid_radius_mm": 11.0}, {"limbus_blend_mm": 0.0},
+    {"eye_position_mm": (0.0, float("inf"), 0.0)},
+])
+def test_an_impossible_person_is_refused(change):
+    scene_refusal(port((12, 0, -30)), replace(Person(), **change))
+
+
+def test_a_gaze_beyond_any_eye_is_refused(led2gaze):
+    scene = Scene(led2gaze, Person())
+    for gaze in ((61, 0), (0, -90), (float("nan"), 0)):
+        with pytest.raises(SceneError):
+            scene.response(*gaze)
+    with pytest.raises(SceneError):
+        scene.response(0, 0, pupil_mm=-2)
+    with pytest.raises(SceneError):
+        scene.response(0, 0, lid_opening=1.5)
+
+
+def test_the_same_seed_is_the_same_person_and_another_seed_another():
+    assert draw_person(7) == draw_person(7)
+    assert draw_person(7) != draw_person(8)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, True])
+def test_a_seed_that_is_no_seed_is_refused(seed):
+    with pytest.raises(SceneError):
+        draw_person(seed)
+
+
+def test_people_have_the_published_means_spreads_and_correlations():
+    people = [draw_person(seed) for seed in range(800)]
+    column = {name: np.array([getattr(p, name) for p in people])
+              for name in ("cornea_radius_mm", "globe_radius_mm", "kappa_azimuth_deg", "cornea_asphericity")}
+    assert abs(column["cornea_radius_mm"].mean() - 7.8) < 0.03 and abs(column["cornea_radius_mm"].std() - 0.26) < 0.02
+    assert abs(column["kappa_azimuth_deg"].mean() - 5.0) < 0.15 and abs(column["kappa_azimuth_deg"].std() - 1.33) < 0.1
+    assert np.corrcoef(column["globe_radius_mm"], column["cornea_radius_mm"])[0, 1] > 0.3
+    assert abs(np.corrcoef(column["globe_radius_mm"], column["kappa_azimuth_deg"])[0, 1]) < 0.12
+
+
+def test_every_one_of_many_people_can_wear_the_default_headset(led2gaze):
+    for seed in range(25):
+        response = Scene(led2gaze, draw_person(seed), quality={"face_step_mm": 1.0}).response(0, 0)
+        assert np.isfinite(response).all() and (response > 0).all()
+
+
+def test_a_person_file_gives_what_it_says_and_the_rest_is_nominal(tmp_path):
+    person = load_person(write(tmp_path, "[person]\ncornea_radius_mm = 8\neye_position_mm = [1, 0, -1]\n"))
+    assert person == replace(Person(), cornea_radius_mm=8.0, eye_position_mm=(1.0, 0.0, -1.0))
+
+
+@pytest.mark.parametrize("text", ["", "[person]\ncornea = 8\n", "[person]\nbrow_mm = 'high'\n", "[person]\nbrow_mm = nan",
+                                  "[person]\neye_position_mm = [1, 2]"])
+def test_a_malformed_person_file_is_refused(tmp_path, text):
+    with pytest.raises(SceneError):
+        load_person(write(tmp_path, text))
