@@ -16,7 +16,7 @@ SLOT_BASE = (0x6000, 0x6C00)
 
 
 def random_model(vectors, seed=0, generation=1, channels=CHANNELS):
-    """A model whose every field is drawn from `seed`; no gaze behind it, but every path of the arithmetic is used.
+    """A model whose every field is drawn from `seed`: no gaze behind it, but every path of the arithmetic.
 
     Its inputs span features 30000 .. 40000 about.
     """
@@ -38,7 +38,7 @@ def random_features(n, seed=0):
 
 
 def put_models(state_dir, images):
-    """Prepare the flash of a virtual Nano that starts with `state_dir`: {slot: image bytes}, the rest erased."""
+    """Prepare the flash in `state_dir` for a virtual Nano: {slot: image bytes}, the rest erased."""
     flash = bytearray(b"\xff" * FLASH_BYTES)
     for slot, image in images.items():
         assert len(image) <= SLOT_BYTES
@@ -92,9 +92,11 @@ def port_with(repo_root, avr_tools, tmp_path_factory):
         out = tmp_path_factory.mktemp("elf") / (source.stem + ".elf")
         firmware = repo_root / "firmware"
         subprocess.run(
-            [avr_tools / "avr-gcc", "-mmcu=atmega328p", "-DF_CPU=16000000L", "-std=gnu11", "-O2", "-Wall", "-Wextra",
-             "-Werror", *flags, *[f"-I{firmware / part}" for part in ("core", "app", "ports/avr328p")], source,
-             firmware / "core" / "sg_wire.c", *sorted((firmware / "ports" / "avr328p").glob("*.c")), "-o", out], check=True)
+            [avr_tools / "avr-gcc", "-mmcu=atmega328p", "-DF_CPU=16000000L", "-std=gnu11", "-O2",
+             "-Wall", "-Wextra", "-Werror", *flags,
+             *[f"-I{firmware / part}" for part in ("core", "app", "ports/avr328p")],
+             source, firmware / "core" / "sg_wire.c",
+             *sorted((firmware / "ports" / "avr328p").glob("*.c")), "-o", out], check=True)
         return out
 
     return build

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An oscilloscope for the virtual Nano in lockstep: stops its clock and reads off when each LED last changed state.
+"""An oscilloscope for the virtual Nano in lockstep: stops its clock and reads off when each LED last changed.
 
-The virtual Nano keeps, per LED, how it is driven and the exact cycle of its last event (a change of drive, or a sample
-taken); so single microseconds of stepping are enough for exact cycles.
+The virtual Nano keeps, per LED, how it is driven and the exact cycle of its last event (a change of drive, or
+a sample taken); so single microseconds of stepping are enough for exact cycles.
 """
 
 from collections import namedtuple
@@ -12,7 +12,8 @@ CYCLES_PER_US = 16
 SLOT_US = 600
 OFF, EMIT, REVERSE, PULLUP, FLOAT, OPEN = range(6)      # how a LED is driven
 
-Node = namedtuple("Node", "drive since held")           # since: cycle of the last event; held: V on the ADC's capacitor
+# since: cycle of the last event; held: volts on the ADC's sample capacitor
+Node = namedtuple("Node", "drive since held")
 Slot = namedtuple("Slot", "led lit release sample dark")    # cycles
 
 
@@ -38,7 +39,7 @@ class Scope:
             self.step(us)
 
     def sampled(self, led, before):
-        """Cycle of the sample taken of a node since the Node `before`, or None: the sample changes what the ADC holds."""
+        """Cycle of the sample taken since the Node `before`, or None: a sample changes what the ADC holds."""
         now = self.node(led)
         return now.since if now.held != before.held else None
 
@@ -51,11 +52,12 @@ class Scope:
             self.step(step_us)
         raise AssertionError(f"nothing seen for {limit_us} us")
 
-    def slots(self, n, exposure_us, between=lambda: None):
+    def slots(self, n, exposure_us, between=lambda: None, skip_us=SLOT_US - 30):
         """The next n slots, one after the other.
 
-        exposure_us   what each LED's exposure is expected to be, us: looked at closely from 8 us before it ends
+        exposure_us   what each LED's exposure should be, us: looked at closely from 8 us before its end
         between       called in every slot while nothing is to be seen
+        skip_us       from one light to where looking for the next begins; less when slots may be late
         Asserts the order of events, and that it is the five other LEDs that emit.
         """
         found = []
@@ -77,5 +79,5 @@ class Scope:
             dark = self.until(lambda: self.node(witness).since if self.node(witness).drive == OFF else None)
             assert all(self.node(i).drive != EMIT for i in range(LEDS))
             found.append(Slot(led, lit, release, sample, dark))
-            self.run_to(lit + SLOT_US * CYCLES_PER_US, 30)
+            self.run_to(lit + skip_us * CYCLES_PER_US, 0)
         return found

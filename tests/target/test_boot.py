@@ -54,7 +54,8 @@ def test_exposures_start_from_the_stored_ones(board):
     assert device.exposure().exposure_us == (40, 50, 60, 70, 80, 90) and not device.exposure().automatic
 
 
-@pytest.mark.parametrize("damage", [b"\xff" * 72, b"\0" * 72, bytes(range(72))], ids=["erased", "zeros", "ramp"])
+@pytest.mark.parametrize("damage", [b"\xff" * 72, b"\0" * 72, bytes(range(72))],
+                         ids=["erased", "zeros", "ramp"])
 def test_damaged_live_state_is_replaced_by_the_defaults(board, tmp_path, damage):
     state = tmp_path / "state"
     state.mkdir()

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cycles, stack, flash and RAM of the shipped binary against tests/budget.csv.
 
-A figure above its budget fails, and so does one more than SLACK below it: then the budget is lowered, in review, like code.
+A figure above its budget fails, and so does one more than SLACK below it: then the budget is lowered, in
+review, like code.
 """
 
 import csv
@@ -16,7 +17,7 @@ SLACK = 0.05
 FRAME_CYCLES = 57_600
 RAM_BYTES = 2048
 STACK_LEAST_FREE = 16
-# What an interrupt costs outside of its markers: entry 4, jump 3, saving and restoring 13 registers, flags, return.
+# What an interrupt costs outside of its markers, at most: entry, jump, 13 registers and flags saved, return.
 ISR_EDGES_CYCLES = 90
 SECTIONS = {"infer": "0", "feature": "1", "output": "2", "sense_isr": "3", "serial_isr": "4", "frame": "5"}
 
@@ -26,8 +27,8 @@ def budget(repo_root):
     """{name: {column: int or None}} of tests/budget.csv for this target."""
     with open(repo_root / "tests" / "budget.csv", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["target"] == TARGET]
-    return {row["name"]: {key: int(row[key]) if row[key] else None for key in ("cycles_max", "stack", "flash", "ram")}
-            for row in rows}
+    columns = ("cycles_max", "stack", "flash", "ram")
+    return {row["name"]: {key: int(row[key]) if row[key] else None for key in columns} for row in rows}
 
 
 def judge(budget, name, column, measured):
@@ -36,7 +37,8 @@ def judge(budget, name, column, measured):
     if measured > allowed:
         return f"{name}: {column} {measured} is above its budget of {allowed}"
     if measured < allowed * (1 - SLACK):
-        return f"{name}: {column} {measured} is better than its budget of {allowed}: write {measured} into tests/budget.csv"
+        return (f"{name}: {column} {measured} is better than its budget of {allowed}: "
+                f"write {measured} into tests/budget.csv")
     return None
 
 
@@ -60,11 +62,12 @@ def test_cycles_of_every_section_while_64_vectors_stream_at_a_megabaud(board, bu
     sections = nano.control.markers()
     net = {name: sections[f"{key}n"] for name, key in SECTIONS.items()}
     for name, section in net.items():
-        print(f"{name}: {section.least:.0f} / {section.mean:.0f} / {section.most:.0f} cycles of {section.count}")
+        print(f"{name}: {section.least:.0f} / {section.mean:.1f} / {section.most:.0f} cycles")
     frames = net["frame"].count
     busy = net["frame"].mean + sum((net[name].mean + ISR_EDGES_CYCLES) * net[name].count / frames
                                    for name in ("sense_isr", "serial_isr"))
-    print(f"busy {100 * busy / FRAME_CYCLES:.1f} % of a frame; frame with interrupts at most {sections['5'].most:.0f} cycles")
+    print(f"busy {100 * busy / FRAME_CYCLES:.1f} % of a frame; "
+          f"with interrupts a frame's work took at most {sections['5'].most:.0f} cycles")
     assert busy < 0.70 * FRAME_CYCLES and sections["5"].most < 0.70 * FRAME_CYCLES
     assert device.status().late_frames == 0
     judge_all(budget, [(name, "cycles_max", int(section.most)) for name, section in net.items()])
@@ -106,18 +109,23 @@ def test_flash_and_ram_of_the_shipped_binary(avr_tools, firmware_elf, budget):
     flash = sizes[".text"] + sizes[".data"]
     print(f"flash {flash} B of 24576, static RAM {static_ram(avr_tools, firmware_elf)} B of {RAM_BYTES}")
     assert flash <= 0x6000
-    judge_all(budget, [("firmware", "flash", flash), ("firmware", "ram", static_ram(avr_tools, firmware_elf))])
+    ram = static_ram(avr_tools, firmware_elf)
+    judge_all(budget, [("firmware", "flash", flash), ("firmware", "ram", ram)])
 
 
 def test_nothing_of_the_binary_lies_in_the_model_slots(avr_tools, firmware_elf):
-    listing = subprocess.run([avr_tools / "avr-objdump", "-h", firmware_elf], check=True, capture_output=True, text=True).stdout
+    listing = run(avr_tools / "avr-objdump", "-h", firmware_elf)
     loaded = [line.split() for line in listing.splitlines() if line.split()[1:2] in ([".text"], [".data"])]
     assert len(loaded) == 2
     assert all(int(row[4], 16) + int(row[2], 16) <= 0x6000 for row in loaded)
 
 
+def run(*command):
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
 def section_sizes(avr_tools, elf):
-    listing = subprocess.run([avr_tools / "avr-size", "-A", "-d", elf], check=True, capture_output=True, text=True).stdout
+    listing = run(avr_tools / "avr-size", "-A", "-d", elf)
     rows = [line.split() for line in listing.splitlines()]
     return {row[0]: int(row[1]) for row in rows if len(row) == 3 and row[1].isdigit()}
 

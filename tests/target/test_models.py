@@ -56,7 +56,8 @@ def test_streamed_gaze_is_what_the_host_computes_from_the_raw_frame(board):
     assert {frame.raw.model_crc for frame in frames} == {model.crc}
     for frame in frames:
         raw, gaze = frame.raw, frame.gaze
-        (az, el, flags), = host_gaze(model, np.array([raw.feature]), (raw.recentre_az_deg_q7 / 128, raw.recentre_el_deg_q7 / 128))
+        recentre_deg = raw.recentre_az_deg_q7 / 128, raw.recentre_el_deg_q7 / 128
+        (az, el, flags), = host_gaze(model, np.array([raw.feature]), recentre_deg)
         flags |= raw.flags
         if raw.flags & (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED):
             flags &= ~lib.SG_FLAG_VALID
@@ -65,7 +66,8 @@ def test_streamed_gaze_is_what_the_host_computes_from_the_raw_frame(board):
     assert any(frame.raw.flags & lib.SG_FLAG_EXPOSURE for frame in frames)
 
 
-@pytest.mark.parametrize("a, b, active", [(1, 2, 1), (2, 1, 0), (0xFFFFFFFF, 0, 1), (0, 0xFFFFFFFF, 0), (7, 7, 0)],
+@pytest.mark.parametrize("a, b, active",
+                         [(1, 2, 1), (2, 1, 0), (0xFFFFFFFF, 0, 1), (0, 0xFFFFFFFF, 0), (7, 7, 0)],
                          ids=["newer_in_b", "newer_in_a", "wrapped_in_b", "wrapped_in_a", "equal_keeps_a"])
 def test_the_newer_generation_is_used(board, a, b, active):
     models = {0: random_model(10, seed=1, generation=a), 1: random_model(10, seed=2, generation=b)}
@@ -77,7 +79,8 @@ def test_the_newer_generation_is_used(board, a, b, active):
 
 
 def test_a_damaged_slot_is_passed_over_and_named(board):
-    good, newer = random_model(12, seed=1, generation=1), bytearray(random_model(12, seed=2, generation=9).image)
+    good = random_model(12, seed=1, generation=1)
+    newer = bytearray(random_model(12, seed=2, generation=9).image)
     newer[300] ^= 1
     _, device = board(models={0: good.image, 1: bytes(newer)})
     info = device.model_info()
@@ -138,7 +141,9 @@ def test_writing_a_trial_leaves_the_one_in_use_before_it_changes(board):
     assert info.active == 1 and info.verdict[lib.SG_SLOT_RAM] == lib.SG_E_STATE
 
 
-@pytest.mark.parametrize("at, error", [(300, lib.SG_E_CRC), (0, lib.SG_E_MAGIC), (96, lib.SG_E_VERSION), (98, lib.SG_E_BOUNDS)],
+@pytest.mark.parametrize("at, error",
+                         [(300, lib.SG_E_CRC), (0, lib.SG_E_MAGIC), (96, lib.SG_E_VERSION),
+                          (98, lib.SG_E_BOUNDS)],
                          ids=["record_flipped", "magic", "version", "vectors"])
 def test_a_bad_trial_is_refused_and_the_stored_model_stays_in_use(board, at, error):
     stored, damaged = random_model(20, seed=1), bytearray(random_model(20, seed=2).image)

@@ -34,7 +34,8 @@ def test_hello_says_what_the_board_is(board):
     assert hello.board == lib.SG_BOARD_NANO328P and hello.channels == 6 and hello.cpu_hz == 16_000_000
     assert hello.slot_base == (0x6000, 0x6C00) and hello.slot_bytes == lib.SG_MODEL_SLOT_BYTES
     assert hello.page_bytes == 128 and hello.frame_period_us == 3600
-    assert hello.trial_bytes == lib.SG_MODEL_HEAD_BYTES + lib.SG_MODEL_TRIAL_VECTORS_MAX * lib.SG_MODEL_RECORD_BYTES
+    vectors = lib.SG_MODEL_TRIAL_VECTORS_MAX
+    assert hello.trial_bytes == lib.SG_MODEL_HEAD_BYTES + vectors * lib.SG_MODEL_RECORD_BYTES
     assert 0 < hello.exposure_min_us < hello.exposure_max_us <= 280
 
 
@@ -68,8 +69,7 @@ def test_truncated_body_is_refused_and_answered_once(board, kind):
     assert device.status().rx_rejected == len({0, whole - 1} - {-1, whole})
 
 
-@pytest.mark.parametrize("kind", sorted(set(HARMLESS) | {lib.SG_MSG_HELLO, lib.SG_MSG_STATUS, lib.SG_MSG_MODEL_INFO}),
-                         ids=lambda kind: f"{kind:02x}")
+@pytest.mark.parametrize("kind", sorted(set(SHORTEST) - {lib.SG_MSG_REBOOT}), ids=lambda kind: f"{kind:02x}")
 def test_longer_body_is_accepted_and_its_excess_ignored(board, kind):
     _, device = board()
     body = HARMLESS.get(kind, b"")
@@ -195,7 +195,8 @@ def test_answers_survive_a_flood_and_dropped_frames_are_counted(board):
     link.sleep(0.05)
     decoder.feed(link.read(4096, 0.01))
     assert decoder.bad == 0 and len(answered) > 300
-    by_kind = {kind: [p.seq for p in streamed if p.type == kind] for kind in (lib.SG_MSG_RAW, lib.SG_MSG_GAZE, lib.SG_MSG_COUNTS)}
+    by_kind = {kind: [p.seq for p in streamed if p.type == kind]
+               for kind in (lib.SG_MSG_RAW, lib.SG_MSG_GAZE, lib.SG_MSG_COUNTS)}
     sensed = max(seqs[-1] for seqs in by_kind.values()) - min(seqs[0] for seqs in by_kind.values()) + 1
     missing = 3 * sensed - len(streamed)
     status = device.status()
@@ -207,6 +208,7 @@ def test_answers_survive_a_flood_and_dropped_frames_are_counted(board):
 def test_a_second_verification_at_once_is_refused_busy_and_the_first_answered(board):
     _, device = board(models={0: random_model(216).image})
     body = wire.body("struct sg_model_at", slot=0)
-    packets = exchange(device, wire.encode(lib.SG_MSG_MODEL_VERIFY, 1, body) + wire.encode(lib.SG_MSG_MODEL_VERIFY, 2, body), 0.2)
-    assert {(p.type, p.seq) for p in packets} == {(lib.SG_MSG_ERROR, 2), (lib.SG_MSG_MODEL_VERIFY | lib.SG_REPLY, 1)}
-    assert refusals(packets) == [(lib.SG_E_BUSY, lib.SG_MSG_MODEL_VERIFY)]
+    kind = lib.SG_MSG_MODEL_VERIFY
+    packets = exchange(device, wire.encode(kind, 1, body) + wire.encode(kind, 2, body), 0.2)
+    assert {(p.type, p.seq) for p in packets} == {(lib.SG_MSG_ERROR, 2), (kind | lib.SG_REPLY, 1)}
+    assert refusals(packets) == [(lib.SG_E_BUSY, kind)]

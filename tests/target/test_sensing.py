@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sensing engine as the LEDs show it: exposures exact to the cycle, a steady frame clock, lights that go out."""
+"""The sensing engine as the LEDs show it: exact exposures, a steady clock, lights that go out."""
 
 import csv
 
@@ -17,7 +17,7 @@ JITTER_CYCLES_MAX = 20 * CYCLES_PER_US
 
 
 def loaded(device):
-    """What to call between events: requests in, answers and all three streams out, inference all the while."""
+    """What to call between events: requests in, answers and all three streams out, and inference."""
     device.set_stream(raw=True, gaze=True, counts=True)
     count = [0]
 
@@ -39,7 +39,7 @@ def test_exposure_is_what_was_asked_for_to_the_cycle_under_load(board, exposure_
     slots = Scope(nano, device.link).slots(120, [exposure_us] * LEDS, load)
     assert {slot.sample - slot.release for slot in slots} == {int(exposure_us * CYCLES_PER_US)}
     settle = [slot.release - slot.lit for slot in slots]
-    print(f"{len(slots)} exposures of {exposure_us} us exact; lit {min(settle)}..{max(settle)} cycles before the release")
+    print(f"{len(slots)} exposures of {exposure_us} us exact; lit {min(settle)}..{max(settle)} cycles before")
     assert 4 * CYCLES_PER_US <= min(settle) and max(settle) <= 6 * CYCLES_PER_US
     assert device.status().late_slots == 0
 
@@ -51,7 +51,8 @@ def test_each_led_has_its_own_exposure_and_the_device_reports_it_exactly(board):
     device.set_stream(counts=True)
     device.link.sleep(0.01)
     slots = Scope(nano, device.link).slots(12, asked)
-    assert {(slot.led, (slot.sample - slot.release) / CYCLES_PER_US) for slot in slots} == set(enumerate(asked))
+    found = {(slot.led, (slot.sample - slot.release) / CYCLES_PER_US) for slot in slots}
+    assert found == set(enumerate(asked))
     frames = collect(device, 20)
     assert {frame.counts.exposure_us_q2 for frame in frames[10:]} == {tuple(int(4 * us) for us in asked)}
 
@@ -90,7 +91,7 @@ def test_timestamps_are_the_mean_of_the_mid_exposures(board, tmp_path):
     frames = {frame.t_us: frame.raw for frame in collect(device, 40)}
     means = [sum((s.release + s.sample) / 2 for s in slots[k:k + LEDS]) / LEDS / CYCLES_PER_US
              for k in range(0, len(slots) - LEDS + 1, LEDS)]
-    # Device time began at the start of the application: a ping says when, well enough to know which frame is which.
+    # Device time began with the application: a ping says when, well enough to tell the frames apart.
     began = device.link.now() * 1e6 - device.ping().tx_us
     offsets = []
     for k, mean in enumerate(means):
@@ -122,10 +123,10 @@ def test_lights_go_out_within_10_us_of_the_sample(board):
     assert 0 < min(after) and max(after) <= 10 * CYCLES_PER_US
 
 
-@pytest.mark.parametrize("flags", [[], ["-DHANG_LIT"]], ids=["main_loop", "everything_while_lit"])
+@pytest.mark.parametrize("bad", ["HANG_LOOP", "HANG_LIT"])
 def test_a_hang_ends_in_the_dark_within_130_ms_and_is_reported_as_watchdog(
-        virtual_nano, any_map, port_with, repo_root, tmp_path, flags):
-    elf = port_with(repo_root / "tests" / "target" / "hang.c", *flags)
+        virtual_nano, any_map, port_with, repo_root, tmp_path, bad):
+    elf = port_with(repo_root / "tests" / "target" / "bad_app.c", f"-DBAD={bad}")
     nano = virtual_nano(map=any_map, unpaced=True, person=1, app=elf, state_dir=tmp_path / "state")
     link = open_link(nano.port)
     scope = Scope(nano, link)
@@ -147,16 +148,55 @@ def test_a_hang_ends_in_the_dark_within_130_ms_and_is_reported_as_watchdog(
     nano.control.frames(None)
     with open(frames, newline="") as file:
         hung = [int(row[1]) for row in csv.reader(file) if row[0] == "sample"][99]
-    if flags:
+    if bad == "HANG_LIT":
         assert len(lit) == 5 and abs(min(lit) - hung) < FRAME_CYCLES   # hung with the lights on
         hung = min(lit)
     assert 100_000 * CYCLES_PER_US < end - hung <= 130_000 * CYCLES_PER_US
-    assert all(scope.node(i).since > end - 200 * CYCLES_PER_US for i in range(LEDS) if scope.node(i).drive == EMIT)
+    still_lit = [node for node in map(scope.node, range(LEDS)) if node.drive == EMIT]
+    assert all(node.since > end - 200 * CYCLES_PER_US for node in still_lit)
 
     link.sleep(0.1)                         # started again
+    assert report(link).reset_cause == lib.SG_RESET_WATCHDOG
+    link.close()
+
+
+def report(link):
+    """What bad_app.c answers to anything said to it."""
     decoder, answers, stop = wire.Decoder(), [], link.now() + 0.1
     link.write(b"\0")
     while not answers and link.now() < stop:
         answers = decoder.feed(link.read(256, 0.01))
-    assert wire.parse(Status, answers[0].body).reset_cause == lib.SG_RESET_WATCHDOG
+    return wire.parse(Status, answers[0].body)
+
+
+def run_bad_app(virtual_nano, any_map, port_with, repo_root, bad):
+    elf = port_with(repo_root / "tests" / "target" / "bad_app.c", f"-DBAD={bad}")
+    nano = virtual_nano(map=any_map, unpaced=True, person=1, app=elf)
+    link = open_link(nano.port)
+    link.sleep(2.0)
+    return nano, link
+
+
+def test_exposures_stay_exact_and_late_slots_are_counted_when_interrupts_are_blocked(
+        virtual_nano, any_map, port_with, repo_root):
+    nano, link = run_bad_app(virtual_nano, any_map, port_with, repo_root, "BLOCK")
+    before = report(link)
+    slots = Scope(nano, link).slots(40 * LEDS, [100] * LEDS, skip_us=0)
+    after = report(link)
+    assert {slot.sample - slot.release for slot in slots} == {1600}
+    lost = [b.lit - a.lit - SLOT_CYCLES for a, b in zip(slots, slots[1:])]
+    assert max(lost) > 100 * CYCLES_PER_US      # the blocking was seen
+    assert after.late_slots > before.late_slots and after.frames - before.frames >= 35
+    link.close()
+
+
+def test_frames_that_come_while_the_main_loop_works_are_counted_late(
+        virtual_nano, any_map, port_with, repo_root):
+    _, link = run_bad_app(virtual_nano, any_map, port_with, repo_root, "SLOW")
+    before = report(link)
+    link.sleep(1.0)
+    after = report(link)
+    assert 270 <= after.frames - before.frames <= 285       # sensing does not wait
+    assert after.late_frames - before.late_frames >= 200 and after.late_slots == before.late_slots
+    assert after.reset_cause == before.reset_cause          # slow is not dead
     link.close()

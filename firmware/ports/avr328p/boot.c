@@ -52,8 +52,8 @@ static uint8_t bootloader_listened(void)
     return left.r10 == 0x11 && left.r11 == 0x05 && left.r14 == 0x01 && left.r15 == 0x08;
 }
 
-// MCUSR says it when the bootloader left it alone; later versions of Optiboot hand it over in r2. Optiboot before
-// 4.6 clears it: then a lost signature means that power was off.
+// MCUSR says it when the bootloader left it alone; later versions of Optiboot hand it over in r2. Optiboot
+// before 4.6 clears it: then a lost signature means that power was off.
 static uint8_t find_cause(void)
 {
     const uint8_t known = SG_RESET_POWER | SG_RESET_EXTERNAL | SG_RESET_BROWNOUT | SG_RESET_WATCHDOG;

@@ -25,6 +25,7 @@ enum {
     SETTLE_CYCLES = 5 * CYCLES_PER_US - 34,     // 34: from the light to the release without the delay
     LATE_CYCLES = 40 * CYCLES_PER_US,
     SOON_CYCLES = 64,               // a compare value nearer than this may be missed
+    WAIT_CYCLES = 60 * CYCLES_PER_US,
     ADC_ON = (1 << ADEN) | (1 << ADPS2) | (1 << ADPS1) | (1 << ADPS0),
     ADC_ARMED = ADC_ON | (1 << ADATE) | (1 << ADIE) | (1 << ADIF),
     ADC_PRECHARGE = ADC_ON | (1 << ADSC),
@@ -51,6 +52,7 @@ static uint8_t filling_buffer;
 static volatile uint8_t ready;                  // 1 + index of a complete frame; 0: none
 static uint8_t led;                             // sensing now
 static uint8_t exposing;                        // between release and sample
+static uint8_t charging;                        // the code is read, the next channel's charge has begun
 static uint16_t slot_start;                     // TCNT1 at which the slot's light goes on
 static uint16_t trigger_cycles[HAL_CHANNELS];   // release to OCR1B
 static volatile uint32_t overflows;
@@ -98,6 +100,7 @@ static inline __attribute__((always_inline)) void light_and_release(void)
     OCR1B = match;
     OCR1A = match + (SAMPLE_CYCLES + LIGHTS_OUT_MARGIN_CYCLES);
     exposing = 1;
+    charging = 0;
 
     filling->release = release;
     filling->exposure_cycles = trigger + EXPOSURE_FIXED_CYCLES;
@@ -107,6 +110,20 @@ static inline __attribute__((always_inline)) void light_and_release(void)
     }
 }
 
+// The next slot that many cycles after this one; at once if that has passed, because a compare value in the
+// past would wait for the timer's next turn.
+static inline __attribute__((always_inline)) void next_slot_after(uint16_t cycles)
+{
+    uint16_t start = slot_start + cycles;
+    const uint16_t soonest = TCNT1 + SOON_CYCLES;
+    if ((int16_t)(start - soonest) < 0) {
+        start = soonest;
+        late_slots++;
+    }
+    slot_start = start;
+    OCR1A = start;
+}
+
 static inline __attribute__((always_inline)) void lights_out(void)
 {
     PORTD = PORTD_DARK;
@@ -114,12 +131,7 @@ static inline __attribute__((always_inline)) void lights_out(void)
     PORTC = led == HAL_CHANNELS - 1 ? 1 : (uint8_t)(led_bit[led] << 1);
     exposing = 0;
 
-    slot_start += SLOT_CYCLES;
-    if ((int16_t)(slot_start - TCNT1) < SOON_CYCLES) {
-        slot_start = TCNT1 + SOON_CYCLES;
-        late_slots++;
-    }
-    OCR1A = slot_start;
+    next_slot_after(SLOT_CYCLES);
 }
 
 ISR(TIMER1_COMPA_vect)
@@ -127,11 +139,11 @@ ISR(TIMER1_COMPA_vect)
     HAL_BEGIN(HAL_SECTION_SENSE);
     if (exposing) {
         lights_out();
-    } else if (ADCSRA & (1 << ADSC)) {
-        // Only after a slot that began more than 100 us late: the sample capacitor is not charged yet.
-        slot_start += 8 * 16 * CYCLES_PER_US;
-        OCR1A = slot_start;
+    } else if (!charging || (ADCSRA & (1 << ADSC))) {
+        // Only when interrupts were late by 100 us: the code is not read, or the sample capacitor not charged
+        // yet.
         late_slots++;
+        next_slot_after(WAIT_CYCLES);
     } else {
         light_and_release();
     }
@@ -155,6 +167,7 @@ ISR(ADC_vect)
     }
     ADMUX = ADMUX_AVCC | led;
     ADCSRA = ADC_PRECHARGE;
+    charging = 1;
     HAL_END(HAL_SECTION_SENSE);
 }
 
@@ -186,6 +199,7 @@ void sense_start(const uint16_t exposure_cycles[HAL_CHANNELS])
     ADMUX = ADMUX_AVCC;
     ADCSRB = (1 << ADTS2) | (1 << ADTS0);   // Timer1 compare match B
     ADCSRA = ADC_PRECHARGE;
+    charging = 1;
 
     TCCR1A = 0;
     TCCR1B = 0;
@@ -221,8 +235,8 @@ uint8_t sense_take(struct hal_frame *frame)
     if (!which)
         return 0;
     HAL_BEGIN(HAL_SECTION_FRAME);
-    // Read without a lock: should the other buffer become complete meanwhile, the engine comes back to this one with
-    // the next release, 100 us later at the earliest.
+    // Read without a lock: should the other buffer become complete meanwhile, the engine comes back to this
+    // one with the next release, 100 us later at the earliest.
     const struct raw_frame *raw = &buffer[which - 1];
     const uint16_t first = raw->slot[0].release;
     for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
