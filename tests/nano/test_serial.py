@@ -100,7 +100,8 @@ def test_every_open_presses_reset_unless_the_trace_is_cut():
         with Board(app=firmware("echo"), auto_reset=auto_reset) as board:
             assert board.run(1000) == b"R"
             for _ in range(3):
-                os.close(os.open(board.ready["port"], os.O_RDWR | os.O_NOCTTY))     # faster than any polling
+                os.close(os.open(board.ready["port"], os.O_RDWR | os.O_NOCTTY))     # gone before anybody looks
+                board.command("time")
             says = board.run(1000)
             assert board.counters()["resets"] == 1 + (4 if auto_reset else 0)
             assert says == (b"R" if auto_reset else b"")

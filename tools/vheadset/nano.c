@@ -215,9 +215,12 @@ int nano_open(struct nano *nano, const struct config *config, struct bridge *bri
     nano->cycles_per_true_second = 16e6 * (1 + config->physics.clock.error
                                            * (2 * noise_uniform(config->seed, NOISE_CLOCK, 0) - 1));
     if (*config->map) {
-        nano->map = sim_map_open(config->map, error, error_bytes);
-        if (!nano->map)
+        char why[200] = "";
+        nano->map = sim_map_open(config->map, why, sizeof why);
+        if (!nano->map) {
+            snprintf(error, error_bytes, "cannot read the map %s: %s", config->map, why);
             return -1;
+        }
         if (sim_map_sensors(nano->map) != LEDS_COUNT || sim_map_emitters(nano->map) != LEDS_COUNT) {
             snprintf(error, error_bytes, "%s is not a map of %d sensors and emitters", config->map, LEDS_COUNT);
             return -1;
