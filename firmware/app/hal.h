@@ -4,8 +4,8 @@
 //
 // A port is one directory of firmware/ports with hal_port.h (sizes and markers) and the down-calls below. It
 // owns the chip: timers, ADC, LEDs, serial line, watchdog, non-volatile memory. It never calls anything but
-// the up-calls. All calls are made from the main loop; interrupts stay inside the port. Nothing blocks for
-// longer than 20 us except hal_boot() and hal_load().
+// the up-calls. All calls are made from the main loop; interrupts stay inside the port. No call waits for
+// hardware, except hal_boot() and hal_load().
 #ifndef HAL_H
 #define HAL_H
 

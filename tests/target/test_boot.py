@@ -54,6 +54,18 @@ def test_exposures_start_from_the_stored_ones(board):
     assert device.exposure().exposure_us == (40, 50, 60, 70, 80, 90) and not device.exposure().automatic
 
 
+def test_automatic_exposures_are_stored_once_they_rest_and_are_the_next_start(board):
+    nano, device = board()
+    device.link.sleep(5)
+    settled, before = device.exposure(), device.status()
+    assert settled.automatic and before.exposure_changes > 0 and before.eeprom_writes == 1
+    device.link.sleep(35)
+    assert device.status().eeprom_writes == 2
+    power_cycle(nano, device)
+    after = device.status()
+    assert device.exposure().exposure_us == settled.exposure_us and after.exposure_changes == 0
+
+
 @pytest.mark.parametrize("damage", [b"\xff" * 72, b"\0" * 72, bytes(range(72))],
                          ids=["erased", "zeros", "ramp"])
 def test_damaged_live_state_is_replaced_by_the_defaults(board, tmp_path, damage):
