@@ -112,9 +112,9 @@ class VirtualControl:
         return int(now), int(device_bytes)
 
     def barrier(self):
-        """Returns once the simulator has noticed what happened on its port before: openings, changes of speed."""
-        # It looks at the port between two rounds of commands. A connection made after an answer belongs to a later
-        # round than that answer.
+        """Returns once the simulator has noticed earlier openings and changes of speed of its port."""
+        # It looks at the port between two rounds of commands. A connection made after an answer belongs to a
+        # later round than that answer.
         self.time()
         with VirtualControl(self.path) as later:
             later.time()

@@ -9,7 +9,8 @@ from .wire import lib
 
 TRY_TIMEOUTS_S = (0.5, 1.0, 2.0)
 BUSY_WAIT_S = 0.02
-WINDOW = 2                      # requests under way at a time: a longer burst overruns the receiver while it senses
+WINDOW = 2                      # requests under way at a time: a longer burst overruns the receiver
+MANY_TRIES = 5                  # of one of many requests: at full rate some meet a busy receiver
 STREAM_KEPT = 3 * 4096          # stream packets kept while nobody takes them
 
 
@@ -107,9 +108,10 @@ class Exchange:
         while todo or waiting:
             while todo and len(waiting) < WINDOW:
                 i, tries = todo.popleft()
-                if tries == len(TRY_TIMEOUTS_S):
+                if tries == MANY_TRIES:
                     raise self._silent()
-                waiting[self.send(kind, bodies[i])] = i, tries, self.link.now() + TRY_TIMEOUTS_S[tries]
+                patience_s = TRY_TIMEOUTS_S[min(tries, len(TRY_TIMEOUTS_S) - 1)]
+                waiting[self.send(kind, bodies[i])] = i, tries, self.link.now() + patience_s
             for packet in self.receive(min(limit for _, _, limit in waiting.values())):
                 if packet.seq not in waiting or packet.type not in (kind | lib.SG_REPLY, lib.SG_MSG_ERROR):
                     self.stale += 1

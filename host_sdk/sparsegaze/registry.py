@@ -88,7 +88,7 @@ def entries():
 
 def find(port):
     """The Entry whose port (or link to it) is `port`, or None."""
-    if "://" in port or not port.startswith((os.sep, ".")) and not os.path.exists(port):
+    if os.name == "nt" or "://" in port or not port.startswith((os.sep, ".")) and not os.path.exists(port):
         return None
     real = os.path.realpath(port)
     for entry in entries():
@@ -125,6 +125,8 @@ def _discard(path):
 
 
 def _alive(pid):
+    if os.name == "nt":             # no virtual Nano runs there, and os.kill() means something else
+        return False
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

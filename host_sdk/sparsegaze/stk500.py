@@ -7,9 +7,9 @@ BOOTLOADERS = ((115200, "Optiboot"), (57600, "ATmegaBOOT"))
 SIGNATURE = b"\x1e\x95\x0f"     # ATmega328P
 PAGE_BYTES = 128
 
-RESET_SETTLE_S = 0.05           # until the bootloader has switched its receiver on: half a command would confuse it
+RESET_SETTLE_S = 0.05           # until the bootloader's receiver is on: half a command would confuse it
 SYNC_WAIT_S = 0.6               # Optiboot blinks for 0.4 s first; see Bootloader.sync
-ANSWER_WAIT_S = 1.0
+ANSWER_WAIT_S = 3.0             # a bootloader that is there answers at once; a busy computer may not
 RESETS_PER_SPEED = 2
 PRESS_WAIT_S = 10.0             # how long a board without auto-reset gets to have its button pressed
 

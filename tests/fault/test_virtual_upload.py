@@ -61,7 +61,7 @@ def test_power_cut_at_any_moment_of_an_upload_leaves_the_old_model_or_the_new_on
     assert store.upload(nano.port, make_image(50)).crc != 0     # and the next upload is in order
 
 
-def test_power_cut_in_the_very_first_upload_leaves_no_model_rather_than_a_half_one(virtual_nano, firmware_hex):
+def test_power_cut_in_the_very_first_upload_leaves_no_half_model(virtual_nano, firmware_hex):
     nano = virtual_nano(map=False, unpaced=True, app=firmware_hex)
     for after, offset_ms in ((("write", 1), 13), (("write", 6), 2), (RECORDS_READ_BACK, 5)):
         cut_upload(nano, make_image(60), after, offset_ms)
@@ -96,7 +96,7 @@ def test_simulator_killed_during_an_upload_is_a_pulled_cable(virtual_nano, firmw
         assert device.read_model() == expected
 
 
-def test_largest_model_fits_a_slot_exactly_and_leaves_its_neighbours_alone(virtual_nano, firmware_hex, tmp_path):
+def test_largest_model_fits_a_slot_and_leaves_its_neighbours_alone(virtual_nano, firmware_hex, tmp_path):
     state = tmp_path / "state"
     nano = virtual_nano(map=False, unpaced=True, app=firmware_hex, state_dir=state)
     images = [make_image(80 + i, vectors=lib.SG_MODEL_VECTORS_MAX) for i in range(2)]
