@@ -105,7 +105,7 @@ uint32_t sg_model_crc32_at(uint32_t crc, const uint8_t *data, uint16_t n, uint8_
 // for: channels, kernel, weight_frac_bits or guards outside their ranges; a channel >= d with an offset,
 // gain, trend, guard row entry or centre that is not 0; a guard with low > high; a row not in use, reserved
 // or pad byte that is not 0; half_c2 >= 2^22. sg_gp relies on all of it.
-// Cost      one pass for the CRC, one over the records; on AVR about 70 cycles per byte of the image.
+// Cost      one pass for the CRC, one over the records; on AVR about 45 cycles per byte of the image.
 // Returns   SG_OK or one of the errors above.
 int sg_model_open(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space);
 
