@@ -32,7 +32,7 @@ QUIET = {
 
 
 def physics():
-    """The constants of physics.toml as a flat dict section.key -> text. (A TOML reader is not in Python 3.9.)"""
+    """The constants of physics.toml, {section.key: text}; without tomllib, which Python 3.9 does not have."""
     flat, section = {}, ""
     for line in PHYSICS.read_text().splitlines():
         line = line.split("#")[0].strip()
@@ -64,8 +64,9 @@ def firmware(name, start=0, define=()):
     newest = max(path.stat().st_mtime for path in (source, SOURCES / "bench.h"))
     if not out.exists() or out.stat().st_mtime < newest:
         part = out.with_name(f"{out.stem}.{os.getpid()}.elf")
-        subprocess.run([avr_gcc(), "-mmcu=atmega328p", "-DF_CPU=16000000UL", "-std=c11", "-Os", "-Wall", "-Wextra",
-                        "-Werror", f"-Wl,--section-start=.text={start:#x}", *(f"-D{d}" for d in define),
+        subprocess.run([avr_gcc(), "-mmcu=atmega328p", "-DF_CPU=16000000UL", "-std=c11", "-Os", "-Wall",
+                        "-Wextra", "-Werror", f"-Wl,--section-start=.text={start:#x}",
+                        *(f"-D{d}" for d in define),
                         "-o", part, source], check=True)
         part.replace(out)
     return out
@@ -93,8 +94,8 @@ class Board:
     def __enter__(self):
         path = self.folder / "config"
         path.write_text("".join(f"{key} {value}\n" for key, value in self.config.items()))
-        self.process = subprocess.Popen([PROGRAM, "--config", path], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                                        text=True)
+        self.process = subprocess.Popen([PROGRAM, "--config", path], stdout=subprocess.PIPE,
+                                        stderr=subprocess.PIPE, text=True)
         line = self.process.stdout.readline()
         if not line:
             raise RuntimeError(self.process.stderr.read().strip())

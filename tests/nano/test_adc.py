@@ -35,8 +35,8 @@ def test_auto_trigger_samples_at_an_exact_cycle(board, ticks):
     board.send(b"T" + struct.pack("<H", ticks))
     code, = struct.unpack("<H", board.run(8000))
     mark, = marks(board, "release")
-    # STS ends two cycles after the mark and starts the count at 0; the flag rises one cycle after the match; three
-    # cycles of synchronisation; two ADC clocks to sample and hold.
+    # STS ends two cycles after the mark and starts the count at 0; the flag rises one cycle after the match;
+    # three cycles of synchronisation; two ADC clocks to sample and hold.
     assert board.node(0)[2] == mark + 2 + ticks + 1 + 3 + 2 * CLOCK
     assert code < 2
 
@@ -92,7 +92,8 @@ def test_noise_offset_and_bandgap_have_the_stated_size():
             board.run(1000)
             codes = []
             for _ in range(60):
-                # LED 0 charged by its pull-up against 2 uA: a voltage away from both ends, the same every time
+                # LED 0 charged by its pull-up against 2 uA: a voltage away from both ends, the same every
+                # time
                 board.command("set ambient sun_gap")
                 board.send(b"X" + struct.pack("<BBHH", 0, 0, 320, 0))
                 codes.append(struct.unpack("<H", board.run(700))[0])

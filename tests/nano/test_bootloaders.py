@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stock bootloaders and stock avrdude: written, verified, read back, started. Nothing knows it is not a real Nano."""
+"""Stock bootloaders and stock avrdude: written, verified, read back, started."""
 
 import shutil
 import subprocess
@@ -13,9 +13,9 @@ from board import ATMEGABOOT, BOOTLOADERS, OPTIBOOT, Board, firmware
 def avrdude(port, baud, *memory):
     program = shutil.which("avrdude")
     assert program, "avrdude is missing: run make setup"
-    return subprocess.run([program, "-q", "-p", "atmega328p", "-c", "arduino", "-P", port, "-b", str(baud), "-D",
-                           *(word for item in memory for word in ("-U", item))], capture_output=True, text=True,
-                          timeout=120)
+    words = [word for item in memory for word in ("-U", item)]
+    return subprocess.run([program, "-q", "-p", "atmega328p", "-c", "arduino", "-P", port, "-b", str(baud),
+                           "-D", *words], capture_output=True, text=True, timeout=120)
 
 
 def image_of(path):
@@ -67,7 +67,7 @@ def test_bootloader_at_the_wrong_speed_is_not_understood():
 
 def test_blank_chip_stays_in_reach_of_the_bootloader():
     with Board(bootloader=OPTIBOOT, start=0x7E00, auto_reset=1, baud=115200) as board:
-        board.run(5000000)                              # no program: it wanders through the empty flash, again and again
+        board.run(5000000)              # no program: it wanders through the empty flash, again and again
         board.port.close()
         board.open()
         board.run(400000)

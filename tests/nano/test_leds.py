@@ -155,7 +155,8 @@ def flat_map(tmp_path_factory):
     gaze = numpy.linspace(-30.0, 30.0, 4)
     mapfile.write_map(path, pupil_mm=3.5, lid_opening=1.0, slip_mm=(0.0, 0.0, 0.0), elevation_deg=gaze,
                       azimuth_deg=gaze, smooth=numpy.ones((1, 1, 1, 1, 1, 4, 4, 6, 6)), glint_lid_opening=1.0,
-                      glint_elevation_deg=gaze, glint_azimuth_deg=gaze, glint=numpy.zeros((1, 1, 1, 1, 4, 4, 6, 6)))
+                      glint_elevation_deg=gaze, glint_azimuth_deg=gaze,
+                      glint=numpy.zeros((1, 1, 1, 1, 4, 4, 6, 6)))
     return path
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated person: latency, main sequence, fixation, pupil, blinks, and where the logs say the eye was."""
+"""The simulated person: latency, main sequence, fixation, pupil, blinks, and the log of where the eye was."""
 
 import math
 
@@ -42,7 +42,7 @@ def test_saccade_starts_after_the_latency_and_lasts_as_the_main_sequence_says(am
     assert abs(end - start - (21 + 2.2 * amplitude)) <= 2
     steps = [b - a for a, b in zip(azimuth, azimuth[1:])]
     assert min(steps) >= -1e-9                                          # smooth: no overshoot
-    peak = max(steps) * 1000                                            # deg/s; minimum jerk: 1.875 times the mean
+    peak = max(steps) * 1000                            # deg/s; minimum jerk: 1.875 times the mean
     assert peak == pytest.approx(1.875 * amplitude / (21 + 2.2 * amplitude) * 1000, rel=0.02)
     assert rows[150][5] == amplitude and rows[50][5] == 0               # target columns
 

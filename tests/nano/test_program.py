@@ -14,15 +14,15 @@ from board import PHYSICS, PROGRAM, QUIET, REPO, Board, firmware, physics
 
 
 def test_constants_equal_the_shared_file():
-    """Where the project's shared folder is at hand, the copy must be it; elsewhere there is nothing to compare."""
+    """Where the project's shared folder is at hand; elsewhere there is nothing to compare."""
     shared = REPO.parent / "shared" / "physics.toml"
     reference = shared if shared.exists() else PHYSICS
     assert PHYSICS.read_bytes() == reference.read_bytes()
 
 
 def test_program_requires_exactly_the_keys_of_the_file():
-    listed = subprocess.run([PROGRAM, "--list-physics"], check=True, capture_output=True, text=True).stdout.split()
-    assert sorted(listed) == sorted(physics())
+    done = subprocess.run([PROGRAM, "--list-physics"], check=True, capture_output=True, text=True)
+    assert sorted(done.stdout.split()) == sorted(physics())
 
 
 def start(tmp_path, lines):
@@ -41,7 +41,8 @@ def good(tmp_path):
     ("nonsense 1", "unknown key `nonsense`"), ("node.junction_pf -1", "bad value for `node.junction_pf`"),
     ("node.pin_pf nan", "bad value"), ("seed -3", "bad value"), ("unpaced 2", "bad value"),
     ("ambient moonlight", "bad value"), ("bootloader_start 0x7E01", "bad value"),
-    ("map /nonexistent.sgmap", "/nonexistent.sgmap"), ("app /nonexistent.hex", "cannot read /nonexistent.hex"),
+    ("map /nonexistent.sgmap", "/nonexistent.sgmap"),
+    ("app /nonexistent.hex", "cannot read /nonexistent.hex"),
 ])
 def test_bad_configuration_is_one_line_and_exit_1(tmp_path, good, bad, message):
     done = start(tmp_path, good + [bad])
@@ -77,9 +78,11 @@ def test_control_socket_survives_garbage():
     with Board(app=firmware("echo"), constants=QUIET) as board:
         assert board.ask("") == board.ask("fly") == "err unknown command"
         assert board.ask("x" * 5000) == "err line too long"
-        for line in ("advance", "advance -1 0", "advance 1e9 0", "target 1 2", "target a b c", "target 1 nan 0",
-                     "set lid 2", "set nothing 1", "set", "power", "cut x", "node 9", "frames", "truth",
-                     "lockstep 2", "markers x y", "truth /nonexistent/dir/file", "advance 99999999999999999999 0"):
+        for line in ("advance", "advance -1 0", "advance 1e9 0", "target 1 2", "target a b c",
+                     "target 1 nan 0", "set lid 2", "set nothing 1", "set", "power", "cut x", "node 9",
+                     "frames", "truth",
+                     "lockstep 2", "markers x y", "truth /nonexistent/dir/file",
+                     "advance 99999999999999999999 0"):
             assert board.ask(line).startswith(("err", "ok")), line
         for _ in range(50):
             blob = bytes(draws.randrange(1, 256) for _ in range(draws.randrange(1, 300))).replace(b"\n", b"?")

@@ -76,7 +76,8 @@ def test_paced_board_does_not_run_ahead_of_true_time():
                 time.sleep(0.05)
             seconds = (board.cycle - first) / 16e6
             elapsed = time.monotonic() - start
-    # It may lag behind on a busy machine and make up for at most a second of lag; unpaced it would be tenfold.
+    # It may lag behind on a busy machine and make up for at most a second of lag; unpaced it would be
+    # tenfold.
     assert 0.2 * elapsed < seconds <= elapsed + 1.0
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The serial line: exact byte times, double buffering, real overruns, speeds that do not match, opens, lost hosts."""
+"""The serial line: byte times, double buffering, overruns, mismatched speeds, opens, slow hosts."""
 
 import os
 import struct
@@ -74,7 +74,8 @@ def test_host_at_another_speed_reads_garbage(board):
 def test_clock_error_counts_towards_the_mismatch():
     errors = set()
     for seed in range(1, 7):
-        with Board(app=firmware("serial"), constants=dict(QUIET, **{"clock.error": 0.03}), seed=seed) as board:
+        constants = dict(QUIET, **{"clock.error": 0.03})
+        with Board(app=firmware("serial"), constants=constants, seed=seed) as board:
             board.run(1000)
             board.port.baudrate = 1025000
             board.send(b"S\x04")
@@ -100,7 +101,8 @@ def test_every_open_presses_reset_unless_the_trace_is_cut():
         with Board(app=firmware("echo"), auto_reset=auto_reset) as board:
             assert board.run(1000) == b"R"
             for _ in range(3):
-                os.close(os.open(board.ready["port"], os.O_RDWR | os.O_NOCTTY))     # gone before anybody looks
+                # gone before anybody looks
+                os.close(os.open(board.ready["port"], os.O_RDWR | os.O_NOCTTY))
                 board.command("time")
             says = board.run(1000)
             assert board.counters()["resets"] == 1 + (4 if auto_reset else 0)

@@ -11,7 +11,8 @@ def test_interrupt_round_trip_and_wake_from_sleep():
         without, with_one, low, high = board.run(3000)
     assert without == 4                                         # lds 2 + sei 1 + nop 1
     assert with_one - without == ENTRY + VECTOR_JMP + RETI      # 11 on the chip, 7 in libsimavr 1.6
-    # The flag rises at OCR1A + 1; out of sleep an entry takes four cycles more; LDS reads in its second cycle.
+    # The flag rises at OCR1A + 1; out of sleep an entry takes four cycles more; LDS reads in its second
+    # cycle.
     assert low + 256 * high == 1 + 4 + ENTRY + VECTOR_JMP + RETI + 1
 
 

@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // How a peripheral of our own takes a register over from libsimavr 1.6, and at which cycle an access happens.
 //
-// The core calls register callbacks while an instruction executes, with avr->cycle = the cycle it began at. On the
-// chip the access is in the last cycle of the instruction: a write takes effect when the instruction ends, a read
-// sees the state one cycle earlier. IN, OUT, SBIC and SBIS take one cycle, the other accesses two.
+// The core calls register callbacks while an instruction executes, with avr->cycle = the cycle it began at.
+// On the chip the access is in the last cycle of the instruction: a write takes effect when the instruction
+// ends, a read sees the state one cycle earlier. IN, OUT, SBIC and SBIS take one cycle, the other accesses
+// two.
 #ifndef ACCESS_H
 #define ACCESS_H
 
@@ -29,8 +30,8 @@ static inline uint64_t access_read_cycle(const avr_t *avr)
     return avr->cycle + access_cycles(avr) - 1;
 }
 
-// Value a register of write-one-to-clear flags receives: SBI on this chip touches its own bit only, while the simulator
-// reads, modifies and writes.
+// Value a register of write-one-to-clear flags receives: SBI on this chip touches its own bit only, while the
+// simulator reads, modifies and writes.
 static inline uint8_t access_flags_written(const avr_t *avr, uint8_t value)
 {
     uint16_t opcode = (uint16_t)(avr->flash[avr->pc] | avr->flash[avr->pc + 1] << 8);
@@ -64,8 +65,8 @@ static inline bool access_enabled(const avr_t *avr, const avr_int_vector_t *vect
     return avr->data[vector->enable.reg] >> vector->enable.bit & 1;
 }
 
-// An interrupt whose request is a level (RXC, UDRE, EEPROM ready, SPM ready): call whenever the level or its enable
-// bit may have changed, and at RETI, because the level asks again.
+// An interrupt whose request is a level (RXC, UDRE, EEPROM ready, SPM ready): call whenever the level or its
+// enable bit may have changed, and at RETI, because the level asks again.
 static inline void access_level(avr_t *avr, avr_int_vector_t *vector, bool level)
 {
     if (level && access_enabled(avr, vector)) {

@@ -77,7 +77,8 @@ void adc_catch_up(struct adc *a, uint64_t cycle)
     // A6 and A7 are wired to nothing: the capacitor keeps what it had.
 }
 
-// Integral non-linearity at a fraction of the range: a fixed smooth curve with both ends at zero, largest magnitude 1.
+// Integral non-linearity at a fraction of the range: a fixed smooth curve with both ends at zero, largest
+// magnitude 1.
 static double inl_shape(const struct adc *a, double x)
 {
     double sum = 0;

@@ -1,13 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // Analog-digital converter of the ATmega328P (datasheet chapter 23), replacing libsimavr's.
 //
-// Timing    the prescaler runs while ADEN is set. A software start waits for its next edge; sample and hold closes 1.5
-//           ADC clocks later, the result is there after 13 (13.5 and 25 for the first conversion after ADEN). A
-//           trigger source's rising edge is seen after 3 CPU cycles, resets the prescaler there, and sample and hold
-//           closes exactly 2 ADC clocks later, the result after 13.5. An edge during a conversion is lost.
-// Result    successive approximation against the reference of each bit's own moment, on the voltage held since the
-//           sample; noise, integral non-linearity, offset and gain error from physics.toml, growing with the ADC clock
-//           above 200 kHz. Channel and reference are those of the start. Reading ADCL locks the register until ADCH.
+// Timing    the prescaler runs while ADEN is set. A software start waits for its next edge; sample and hold
+//           closes 1.5 ADC clocks later, the result is there after 13 (13.5 and 25 for the first conversion
+//           after ADEN). A trigger source's rising edge is seen after 3 CPU cycles, resets the prescaler
+//           there, and sample and hold closes exactly 2 ADC clocks later, the result after 13.5. An edge
+//           during a conversion is lost.
+// Result    successive approximation against the reference of each bit's own moment, on the voltage held
+//           since the sample; noise, integral non-linearity, offset and gain error from physics.toml, growing
+//           with the ADC clock above 200 kHz. Channel and reference are those of the start. Reading ADCL
+//           locks the register until ADCH.
 // Sources   free running (ADTS 0), Timer1 compare B (5), Timer1 overflow (6).
 // Not here  the other trigger sources, ADC noise reduction sleep, the comparator's multiplexer.
 #ifndef ADC_H

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // The USB bridge: a pseudo terminal, a ring of a megabyte each way, and the news of who opens the port.
 //
-// While nobody has the slave open, what the device sends is lost, as on a closed port; what a client left unread when
-// it closed is thrown away. Opens and closes are watched with inotify, because polling for a hang-up misses a fast
-// close and open.
+// While nobody has the slave open, what the device sends is lost, as on a closed port; what a client left
+// unread when it closed is thrown away. Opens and closes are watched with inotify, because polling for a
+// hang-up misses a fast close and open.
 #ifndef BRIDGE_H
 #define BRIDGE_H
 

@@ -127,8 +127,8 @@ static void do_state(struct call *c)
     uint64_t cycle = c->nano->avr->cycle;
     person_view_at(&c->nano->person, (double)cycle / 16, &v);
     say(c, "ok %" PRIu64 " %.6f %.6f %.5f %.5f %.6f %.6f %d", cycle / 16, v.state.azimuth_deg,
-        v.state.elevation_deg, v.state.pupil_mm, v.state.lid_opening, v.target_azimuth_deg, v.target_elevation_deg,
-        v.blink);
+        v.state.elevation_deg, v.state.pupil_mm, v.state.lid_opening, v.target_azimuth_deg,
+        v.target_elevation_deg, v.blink);
 }
 
 static void do_truth(struct call *c)
@@ -224,7 +224,8 @@ static void do_set(struct call *c)
         if ((good = real(value, -20, 20, &number)))
             person->slip_mm[key[5] - 'x'] = number;
     } else {
-        say(c, "err set takes ambient, light, lid, pupil_mean_mm, warmer_k, slip_x, slip_y or slip_z and a value");
+        say(c, "err set takes ambient, light, lid, pupil_mean_mm, warmer_k, slip_x, slip_y or slip_z"
+            " and a value");
         return;
     }
     say(c, good ? "ok" : "err bad value");
@@ -247,15 +248,15 @@ static void do_counters(struct call *c)
     const struct bridge *b = &c->session->bridge;
     say(c, "ok uart_overruns=%" PRIu64 " rx_garbage=%" PRIu64 " tx_garbage=%" PRIu64 " rx_bytes=%" PRIu64
         " tx_bytes=%" PRIu64 " spm_denied=%" PRIu64 " page_writes=%" PRIu64 " eeprom_writes=%" PRIu64
-        " wdt_resets=%" PRIu64 " resets=%" PRIu64 " power_ons=%" PRIu64 " crashes=%" PRIu64 " host_dropped=%" PRIu64
-        " device_dropped=%" PRIu64 " clients=%d conversions=%" PRIu64,
+        " wdt_resets=%" PRIu64 " resets=%" PRIu64 " power_ons=%" PRIu64 " crashes=%" PRIu64
+        " host_dropped=%" PRIu64 " device_dropped=%" PRIu64 " clients=%d conversions=%" PRIu64,
         n->uart.overruns, n->uart.rx_garbage, n->uart.tx_garbage, n->uart.rx_bytes, n->uart.tx_bytes,
-        n->selfprog.denied, n->selfprog.page_writes, n->eeprom.writes, n->watchdog_resets, n->resets, n->power_ons,
-        n->crashes, b->host_dropped, b->device_dropped, b->clients, n->adc.conversions);
+        n->selfprog.denied, n->selfprog.page_writes, n->eeprom.writes, n->watchdog_resets, n->resets,
+        n->power_ons, n->crashes, b->host_dropped, b->device_dropped, b->clients, n->adc.conversions);
 }
 
-// For bench tests: a node's voltage now, how it is driven, when that began or a sample was taken, and what the sample
-// capacitor holds.
+// For bench tests: a node's voltage now, how it is driven, when that began or a sample was taken, and what
+// the sample capacitor holds.
 static void do_node(struct call *c)
 {
     uint64_t i;
@@ -264,8 +265,8 @@ static void do_node(struct call *c)
         return;
     }
     const struct led *led = &c->nano->leds.led[i];
-    say(c, "ok %.15g %d %" PRIu64 " %.15g", leds_peek(&c->nano->leds, (int)i, c->nano->avr->cycle), (int)led->drive,
-        led->since, c->nano->adc.held_volts);
+    double volts = leds_peek(&c->nano->leds, (int)i, c->nano->avr->cycle);
+    say(c, "ok %.15g %d %" PRIu64 " %.15g", volts, (int)led->drive, led->since, c->nano->adc.held_volts);
 }
 
 static void do_quit(struct call *c)
@@ -280,7 +281,8 @@ void command_run(struct session *session, const char *line, char *reply)
         {"time", do_time}, {"lockstep", do_lockstep}, {"advance", do_advance}, {"target", do_target},
         {"targets", do_targets}, {"follow", do_follow}, {"motion", do_motion}, {"state", do_state},
         {"truth", do_truth}, {"frames", do_frames}, {"reset", do_reset}, {"power", do_power}, {"cut", do_cut},
-        {"set", do_set}, {"markers", do_markers}, {"counters", do_counters}, {"node", do_node}, {"quit", do_quit},
+        {"set", do_set}, {"markers", do_markers}, {"counters", do_counters}, {"node", do_node},
+        {"quit", do_quit},
     };
     char words[LINE_BYTES], rest[LINE_BYTES];
     struct call c = {.session = session, .nano = &session->nano, .rest = "", .reply = reply};

@@ -7,7 +7,8 @@ struct session;
 
 enum { COMMAND_REPLY_BYTES = 4096 };
 
-// Carry out one line. reply[COMMAND_REPLY_BYTES] receives `ok ...` or `err ...` without newline, room left for one.
+// Carry out one line. reply[COMMAND_REPLY_BYTES] receives `ok ...` or `err ...` without newline, room left
+// for one.
 void command_run(struct session *session, const char *line, char *reply);
 
 #endif

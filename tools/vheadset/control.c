@@ -28,8 +28,9 @@ int control_open(struct control *c, const char *path, struct session *session)
     if (c->listener < 0)
         return -1;
     unlink(path);
-    return bind(c->listener, (struct sockaddr *)&address, sizeof address) || listen(c->listener, CONTROL_CLIENTS)
-         ? -1 : 0;
+    if (bind(c->listener, (struct sockaddr *)&address, sizeof address))
+        return -1;
+    return listen(c->listener, CONTROL_CLIENTS);
 }
 
 void control_close(struct control *c)

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// The control socket: a Unix stream socket, one command a line, each answered by one line `ok ...` or `err ...`.
-// The commands are described in README.md.
+// The control socket: a Unix stream socket, one command a line, each answered by one line `ok ...` or `err
+// ...`. The commands are described in README.md.
 #ifndef CONTROL_H
 #define CONTROL_H
 

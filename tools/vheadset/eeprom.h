@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// EEPROM of the ATmega328P with its times: a byte takes 3.4 ms (erase and write) or 1.8 ms (either alone, EEPM), EEPE
-// stays set meanwhile, EEMPE falls after four cycles, the ready interrupt is a level. A byte under way when the power
-// fails is left corrupt.
+// EEPROM of the ATmega328P with its times: a byte takes 3.4 ms (erase and write) or 1.8 ms (either alone,
+// EEPM), EEPE stays set meanwhile, EEMPE falls after four cycles, the ready interrupt is a level. A byte
+// under way when the power fails is left corrupt.
 #ifndef EEPROM_H
 #define EEPROM_H
 

@@ -18,8 +18,8 @@ static const uint64_t RESPONSE_REUSE_CYCLES = 800;  // 50 us: the fastest saccad
 
 double leds_charge_pc(const struct physics *p, double volts, double extra_pf)
 {
-    double power = 1 - GRADING;
-    double junction = p->node.junction_pf * BUILT_IN_VOLTS / power * (pow(1 + volts / BUILT_IN_VOLTS, power) - 1);
+    double power = 1 - GRADING, scale = p->node.junction_pf * BUILT_IN_VOLTS / power;
+    double junction = scale * (pow(1 + volts / BUILT_IN_VOLTS, power) - 1);
     return junction + (p->node.pin_pf + extra_pf) * volts;
 }
 
@@ -36,7 +36,8 @@ double leds_volts(const struct physics *p, double charge_pc, double extra_pf)
     for (int i = 0; i < 40; i++) {
         if (volts < FLOOR_VOLTS)
             volts = FLOOR_VOLTS;
-        double step = (leds_charge_pc(p, volts, extra_pf) - charge_pc) / (capacitance_pf(p, volts) + extra_pf);
+        double excess_pc = leds_charge_pc(p, volts, extra_pf) - charge_pc;
+        double step = excess_pc / (capacitance_pf(p, volts) + extra_pf);
         volts -= step;
         if (fabs(step) < 1e-12)
             break;
@@ -344,8 +345,8 @@ void leds_set_light(struct leds *l, enum light light)
     l->scale_na = l->map ? na[light] / sim_map_mean(l->map) : 0;
 }
 
-void leds_attach(struct leds *l, avr_t *avr, struct adc *adc, struct person *person, const struct sim_map *map,
-                 const struct config *config, double cycles_per_true_second)
+void leds_attach(struct leds *l, avr_t *avr, struct adc *adc, struct person *person,
+                 const struct sim_map *map, const struct config *config, double cycles_per_true_second)
 {
     static const struct { char port; int irq; avr_irq_notify_t call; } hooks[] = {
         {'C', IOPORT_IRQ_REG_PORT, on_port_c}, {'C', IOPORT_IRQ_DIRECTION_ALL, on_ddr_c},

@@ -1,18 +1,19 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // The six LEDs, electrically. LED i has its cathode on PC i and its anode, through a resistor, on PD (2 + i).
 //
-// Node      the cathode with the junction's and the pin's capacitance. Driven pins set it at once. With the anode low
-//           and the cathode an input without pull-up it floats: photocurrent, ambient light and leakage discharge it.
-// Charge    F(V) = Qj(V) + pin_pf V, Qj(V) = integral of C0 / (1 + v/0.7)^0.4 from 0 to V. Integrated exactly: the
-//           charge collected while floating is a sum over stretches of constant emitters, each with the response map at
-//           its middle; F is then inverted by Newton's method (to 1e-12 V).
-// Sampling  from the start of a conversion to its sample, the sample capacitor, still holding the last converted voltage,
-//           hangs on the node: the sum of both charges is kept, and both are discharged together. A driven node is
-//           stiff and simply charges it.
-// Floor     illuminated, the junction stops at a forward voltage: the node does not fall below -0.25 V. The charged
-//           capacitor joins late, so a channel that ran into the floor reads 1.1 V or less, not zero.
-// Supply    each lit emitter draws 20 mA through source_ohm; ripple is drawn anew for every release of a node, every
-//           sample of a driven node and every conversion's reference.
+// Node      the cathode with the junction's and the pin's capacitance. Driven pins set it at once. With the
+//           anode low and the cathode an input without pull-up it floats: photocurrent, ambient light and
+//           leakage discharge it.
+// Charge    F(V) = Qj(V) + pin_pf V, Qj(V) = integral of C0 / (1 + v/0.7)^0.4 from 0 to V. Integrated
+//           exactly: the charge collected while floating is a sum over stretches of constant emitters, each
+//           with the response map at its middle; F is then inverted by Newton's method (to 1e-12 V).
+// Sampling  from the start of a conversion to its sample, the sample capacitor, still holding the last
+//           converted voltage, hangs on the node: the sum of both charges is kept, and both are discharged
+//           together. A driven node is stiff and simply charges it.
+// Floor     illuminated, the junction stops at a forward voltage: the node does not fall below -0.25 V. The
+//           charged capacitor joins late, so a channel that ran into the floor reads 1.1 V or less, not zero.
+// Supply    each lit emitter draws 20 mA through source_ohm; ripple is drawn anew for every release of a
+//           node, every sample of a driven node and every conversion's reference.
 #ifndef LEDS_H
 #define LEDS_H
 
@@ -74,8 +75,8 @@ struct leds {
     struct led led[LEDS_COUNT];
 };
 
-void leds_attach(struct leds *leds, avr_t *avr, struct adc *adc, struct person *person, const struct sim_map *map,
-                 const struct config *config, double cycles_per_true_second);
+void leds_attach(struct leds *leds, avr_t *avr, struct adc *adc, struct person *person,
+                 const struct sim_map *map, const struct config *config, double cycles_per_true_second);
 // After every reset of the chip: all pins are inputs. fresh: power was off, every node is empty.
 void leds_reset(struct leds *leds, bool fresh);
 

@@ -69,7 +69,8 @@ static void serve(struct control *control)
         fds[n++] = (struct pollfd){.fd = session.bridge.watch, .events = POLLIN};
         if (session.started && !session.lockstep)
             fds[n++] = (struct pollfd){.fd = session.bridge.master, .events = POLLIN};
-        struct timespec timeout = {.tv_sec = (time_t)wait, .tv_nsec = (long)((wait - (double)(time_t)wait) * 1e9)};
+        struct timespec timeout = {.tv_sec = (time_t)wait};
+        timeout.tv_nsec = (long)((wait - (double)timeout.tv_sec) * 1e9);
         // Blocked between the question and ppoll, so that no signal is slept through.
         sigprocmask(SIG_BLOCK, &blocked, &before);
         if (!session.stop)

@@ -57,7 +57,8 @@ static void on_running(avr_irq_t *irq, uint32_t vector, void *param)
     struct markers *m = param;
     avr_t *avr = m->avr;
     (void)irq;
-    // On entry the simulator raises this before it pushes the vector on its own list, at RETI after taking it off.
+    // On entry the simulator raises this before it pushes the vector on its own list, at RETI after taking it
+    // off.
     bool entry = vector && avr->sreg[S_I] == 0;
     if (entry) {
         if (m->depth < MARKERS_NESTING)

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Exact cycle counts by GPIOR0, frame moments by GPIOR1, and the four cycles an interrupt takes to begin (eight out of
-// sleep), which libsimavr 1.6 counts as none.
+// Exact cycle counts by GPIOR0, frame moments by GPIOR1, and the four cycles an interrupt takes to begin
+// (eight out of sleep), which libsimavr 1.6 counts as none.
 //
-// Writing 2k+1 to GPIOR0 begins section k, 2k+2 ends it. A section is counted from the end of the first OUT to the LDI
-// before the second: two cycles are taken off the distance between the two. "Net" leaves out interrupts that began and
-// ended inside the section, their entry included.
+// Writing 2k+1 to GPIOR0 begins section k, 2k+2 ends it. A section is counted from the end of the first OUT
+// to the LDI before the second: two cycles are taken off the distance between the two. "Net" leaves out
+// interrupts that began and ended inside the section, their entry included.
 #ifndef MARKERS_H
 #define MARKERS_H
 

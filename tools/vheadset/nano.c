@@ -19,8 +19,8 @@ static const char FLASH_IMAGE[] = "flash.bin", EEPROM_IMAGE[] = "eeprom.bin";
 // Of libsimavr; exported but not declared in an installed header.
 avr_flashaddr_t avr_run_one(avr_t *avr);
 
-// One batch of instructions, up to the next timer or interrupt. Replaces libsimavr's loop, which sleeps in real time
-// and overshoots a sleep by a cycle.
+// One batch of instructions, up to the next timer or interrupt. Replaces libsimavr's loop, which sleeps in
+// real time and overshoots a sleep by a cycle.
 static void run_batch(struct nano *nano)
 {
     avr_t *avr = nano->avr;
@@ -69,8 +69,8 @@ static void after_reset(struct nano *nano, enum nano_reset cause)
     nano->reset_flags = cause == NANO_RESET_POWER ? NANO_RESET_POWER : nano->reset_flags | (uint8_t)cause;
     avr->data[MCUSR] = nano->reset_flags;
     avr->run_cycle_limit = BATCH_CYCLES;
-    // INT0 and INT1 are on two anodes. Left alone, the stock module looks at such a pin every cycle while it is low,
-    // once more for every time it became low.
+    // INT0 and INT1 are on two anodes. Left alone, the stock module looks at such a pin every cycle while it
+    // is low, once more for every time it became low.
     avr_extint_set_strict_lvl_trig(avr, 0, 0);
     avr_extint_set_strict_lvl_trig(avr, 1, 0);
     timer1_reset(&nano->timer1);
@@ -198,8 +198,8 @@ static int load(struct nano *nano, char *error, size_t error_bytes)
             return -1;
         memcpy(flash + c->bootloader_start, boot + c->bootloader_start, FLASH_BYTES - c->bootloader_start);
     }
-    if (*c->app
-        && hexfile_load(c->app, flash, *c->bootloader ? c->bootloader_start : FLASH_BYTES, error, error_bytes) < 0)
+    uint32_t limit = *c->bootloader ? c->bootloader_start : FLASH_BYTES;
+    if (*c->app && hexfile_load(c->app, flash, limit, error, error_bytes) < 0)
         return -1;
     nano->selfprog.dirty = memcmp(before, flash, sizeof before) != 0;
     return 0;
@@ -222,7 +222,8 @@ int nano_open(struct nano *nano, const struct config *config, struct bridge *bri
             return -1;
         }
         if (sim_map_sensors(nano->map) != LEDS_COUNT || sim_map_emitters(nano->map) != LEDS_COUNT) {
-            snprintf(error, error_bytes, "%s is not a map of %d sensors and emitters", config->map, LEDS_COUNT);
+            snprintf(error, error_bytes, "%s is not a map of %d sensors and emitters", config->map,
+                     LEDS_COUNT);
             return -1;
         }
     }

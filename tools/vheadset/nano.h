@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// The board: libsimavr's ATmega328P at 16 MHz with our peripherals, the LEDs, the person before them, power and reset.
-// Time is avr->cycle: it starts at 0 with the program, never goes back, and passes while the power is off too.
+// The board: libsimavr's ATmega328P at 16 MHz with our peripherals, the LEDs, the person before them, power
+// and reset. Time is avr->cycle: it starts at 0 with the program, never goes back, and passes while the power
+// is off too.
 #ifndef NANO_H
 #define NANO_H
 
@@ -20,7 +21,8 @@
 #include "uart.h"
 #include "watchdog.h"
 
-enum nano_reset { NANO_RESET_POWER = 1, NANO_RESET_EXTERNAL = 2, NANO_RESET_BROWNOUT = 4, NANO_RESET_WATCHDOG = 8 };
+// Bits of MCUSR.
+enum nano_reset { NANO_RESET_POWER = 1, NANO_RESET_EXTERNAL = 2, NANO_RESET_WATCHDOG = 8 };
 
 struct nano {
     avr_t *avr;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Random draws by counter: a draw depends only on (seed, purpose, counter), never on how often or when the host
-// asked for another one. That is what makes a run reproducible from its seed.
+// Random draws by counter: a draw depends only on (seed, purpose, counter), never on how often or when the
+// host asked for another one. That is what makes a run reproducible from its seed.
 #ifndef NOISE_H
 #define NOISE_H
 

@@ -18,7 +18,8 @@ static double smooth(double x)
     return x <= 0 ? 0 : x >= 1 ? 1 : x * x * x * (10 + x * (6 * x - 15));
 }
 
-static void move_to(struct person_move *m, double now_ms, const double from[2], double azimuth, double elevation)
+static void move_to(struct person_move *m, double now_ms, const double from[2], double azimuth,
+                    double elevation)
 {
     m->from[0] = from[0];
     m->from[1] = from[1];
@@ -81,9 +82,10 @@ static void tick(struct person *p, int64_t ms)
     while (p->next < p->targets && now * 1e3 >= p->target[p->next].us + latency_ms(p, p->looked_at) * 1e3) {
         const struct person_target *t = &p->target[p->next++];
         uint64_t index = p->looked_at++;
-        double bias = p->motion ? p->bias_deg : 0;
-        move_to(&p->saccade, now, gaze, t->azimuth_deg + bias * noise_normal(p->seed, NOISE_EYE_BIAS, 2 * index),
-                t->elevation_deg + bias * noise_normal(p->seed, NOISE_EYE_BIAS, 2 * index + 1));
+        double size = p->motion ? p->bias_deg : 0;
+        double bias_azimuth = size * noise_normal(p->seed, NOISE_EYE_BIAS, 2 * index);
+        double bias_elevation = size * noise_normal(p->seed, NOISE_EYE_BIAS, 2 * index + 1);
+        move_to(&p->saccade, now, gaze, t->azimuth_deg + bias_azimuth, t->elevation_deg + bias_elevation);
     }
     moved(&p->micro, now, micro);
     if (now >= p->micro_next_ms) {
@@ -97,8 +99,10 @@ static void tick(struct person *p, int64_t ms)
     for (int i = 0; i < 2; i++)
         p->drift[i] = keep * p->drift[i] + sqrt(1 - keep * keep) * p->drift_deg
                     * noise_normal(p->seed, NOISE_EYE_DRIFT, 2 * n + (uint64_t)i);
-    double slow = filtered(p->pupil_slow, PUPIL_S, p->pupil_drift_mm, noise_normal(p->seed, NOISE_EYE_PUPIL, n));
-    double fast = filtered(p->hippus, HIPPUS_S, p->hippus_mm, noise_normal(p->seed, NOISE_EYE_HIPPUS, n));
+    double pupil_draw = noise_normal(p->seed, NOISE_EYE_PUPIL, n);
+    double slow = filtered(p->pupil_slow, PUPIL_S, p->pupil_drift_mm, pupil_draw);
+    double hippus_draw = noise_normal(p->seed, NOISE_EYE_HIPPUS, n);
+    double fast = filtered(p->hippus, HIPPUS_S, p->hippus_mm, hippus_draw);
     double lid = lids(p, now, &out->blink);
     double on = p->motion ? 1 : 0;
     out->azimuth_deg = gaze[0] + on * (micro[0] + p->drift[0]);
@@ -129,9 +133,12 @@ void person_view_at(struct person *p, double us, struct person_view *view)
     memset(view, 0, sizeof *view);
     view->target_azimuth_deg = shown ? shown->azimuth_deg : 0;
     view->target_elevation_deg = shown ? shown->elevation_deg : 0;
-    view->state.azimuth_deg = p->follow ? between(a->azimuth_deg, b->azimuth_deg, x) : view->target_azimuth_deg;
-    view->state.elevation_deg = p->follow ? between(a->elevation_deg, b->elevation_deg, x)
-                                          : view->target_elevation_deg;
+    view->state.azimuth_deg = view->target_azimuth_deg;
+    view->state.elevation_deg = view->target_elevation_deg;
+    if (p->follow) {
+        view->state.azimuth_deg = between(a->azimuth_deg, b->azimuth_deg, x);
+        view->state.elevation_deg = between(a->elevation_deg, b->elevation_deg, x);
+    }
     view->state.pupil_mm = between(a->pupil_mm, b->pupil_mm, x);
     view->state.lid_opening = p->lid_forced >= 0 ? p->lid_forced : between(a->lid_opening, b->lid_opening, x);
     memcpy(view->state.slip_mm, p->slip_mm, sizeof p->slip_mm);

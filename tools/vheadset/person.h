@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // The simulated person: where the eye looks, pupil and lids, as a function of the device's time.
 //
-// Targets are scheduled in device microseconds. The eye follows a target after a latency (N(200, 20) ms, drawn per
-// target) by a saccade on the main sequence (21 ms + 2.2 ms/deg, minimum-jerk profile), landing on the target plus a
-// fixation bias drawn per target. Within a fixation: drift (Ornstein-Uhlenbeck, time constant 1 s) and microsaccades
-// (1.2 per second, same profile). Pupil: mean of the person, slow drift (10 s) and hippus (0.25 s). Blinks: lids close
-// in 70 ms, stay 20 ms, open in 150 ms. Everything steps on a 1 ms grid from counted draws, so the trajectory depends
-// on the seed and the target schedule alone.
+// Targets are scheduled in device microseconds. The eye follows a target after a latency (N(200, 20) ms,
+// drawn per target) by a saccade on the main sequence (21 ms + 2.2 ms/deg, minimum-jerk profile), landing on
+// the target plus a fixation bias drawn per target. Within a fixation: drift (Ornstein-Uhlenbeck, time
+// constant 1 s) and microsaccades (1.2 per second, same profile). Pupil: mean of the person, slow drift (10
+// s) and hippus (0.25 s). Blinks: lids close in 70 ms, stay 20 ms, open in 150 ms. Everything steps on a 1 ms
+// grid from counted draws, so the trajectory depends on the seed and the target schedule alone.
 #ifndef PERSON_H
 #define PERSON_H
 

@@ -160,8 +160,8 @@ void selfprog_attach(struct selfprog *s, avr_t *avr, uint32_t boot_start)
     avr_irq_register_notify(&s->ready->irq[AVR_INT_IRQ_RUNNING], on_return, s);
 }
 
-// A reset does not stop the charge pump at once, but what it leaves is as undefined as after a cut; bootloaders are
-// not reset while they program. The page under way is finished.
+// A reset does not stop the charge pump at once, but what it leaves is as undefined as after a cut;
+// bootloaders are not reset while they program. The page under way is finished.
 void selfprog_reset(struct selfprog *s)
 {
     if (s->busy)
@@ -177,7 +177,8 @@ void selfprog_cut(struct selfprog *s, uint64_t seed)
         return;
     uint8_t *page = s->flash + s->page;
     for (int i = 0; i < FLASH_PAGE_BYTES; i++) {
-        uint8_t random = (uint8_t)noise_bits(seed, NOISE_CORRUPT, s->avr->cycle * FLASH_PAGE_BYTES + (uint64_t)i);
+        uint64_t draw = s->avr->cycle * FLASH_PAGE_BYTES + (uint64_t)i;
+        uint8_t random = (uint8_t)noise_bits(seed, NOISE_CORRUPT, draw);
         page[i] = s->erasing ? page[i] | random : page[i] & (s->buffer[i] | random);
     }
     s->busy = false;

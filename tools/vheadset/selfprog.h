@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // Self-programming of the ATmega328P, replacing libsimavr's SPM.
 //
-// Page erase and page write take 4 ms each. In the read-while-write section (below 0x7000) they run while the CPU goes
-// on; until RWWSRE that section reads as 0xFF. Above, the CPU stands still. A write only clears bits; words not filled
-// keep their value. Only code at or above the boot section's start may program, and (lock bits 0xCF, as shipped) not the
-// boot section itself. A page under way when the power fails is left corrupt.
+// Page erase and page write take 4 ms each. In the read-while-write section (below 0x7000) they run while the
+// CPU goes on; until RWWSRE that section reads as 0xFF. Above, the CPU stands still. A write only clears
+// bits; words not filled keep their value. Only code at or above the boot section's start may program, and
+// (lock bits 0xCF, as shipped) not the boot section itself. A page under way when the power fails is left
+// corrupt.
 #ifndef SELFPROG_H
 #define SELFPROG_H
 

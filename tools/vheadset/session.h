@@ -2,10 +2,11 @@
 // A running board and its clock.
 //
 // Paced     true time = cycles / 16e6 / (1 + clock error); the board runs in slices of about a millisecond.
-// Unpaced   as fast as it goes, from the first client on: until somebody opens the port, presses reset or speaks about
-//           time, the clock stands at 0, so that what follows does not depend on how fast the host was.
-// Lockstep  (unpaced only) the clock stands still except inside session_advance(): what the device does then depends on
-//           the seed and on the sequence of advances and bytes alone.
+// Unpaced   as fast as it goes, from the first client on: until somebody opens the port, presses reset or
+//           speaks about time, the clock stands at 0, so that what follows does not depend on how fast the
+//           host was.
+// Lockstep  (unpaced only) the clock stands still except inside session_advance(): what the device does then
+//           depends on the seed and on the sequence of advances and bytes alone.
 #ifndef SESSION_H
 #define SESSION_H
 
@@ -35,7 +36,8 @@ int session_close(struct session *session);
 
 // Opens of the port, its speed. Call before time passes and before anything that depends on them.
 void session_notice(struct session *session);
-// Let time pass as the mode has it. Returns how long the caller may sleep, seconds; negative: until something happens.
+// Let time pass as the mode has it. Returns how long the caller may sleep, seconds; negative: until something
+// happens.
 double session_run(struct session *session);
 void session_start(struct session *session);
 void session_lockstep(struct session *session, bool on);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Timer1 of the ATmega328P, exact to the cycle: normal and CTC modes, internal clock, compare A and B, overflow, the
-// shared TEMP byte, flags that wait for their enable bit, and the edge that triggers the ADC.
+// Timer1 of the ATmega328P, exact to the cycle: normal and CTC modes, internal clock, compare A and B,
+// overflow, the shared TEMP byte, flags that wait for their enable bit, and the edge that triggers the ADC.
 // Not modelled: PWM modes (they count like normal mode), input capture, output pins, external clock, GTCCR.
 #ifndef TIMER1_H
 #define TIMER1_H

@@ -30,9 +30,9 @@ void truth_write(struct truth *t, struct person *person, uint64_t cycle)
     for (; t->next_ms * CYCLES_PER_MS <= cycle; t->next_ms++) {
         struct person_view v;
         person_view_at(person, (double)t->next_ms * 1e3, &v);
-        fprintf(t->file, "%" PRIu64 ",%.5f,%.5f,%.4f,%.4f,%.5f,%.5f\n", t->next_ms * 1000, v.state.azimuth_deg,
-                v.state.elevation_deg, v.state.pupil_mm, v.state.lid_opening, v.target_azimuth_deg,
-                v.target_elevation_deg);
+        fprintf(t->file, "%" PRIu64 ",%.5f,%.5f,%.4f,%.4f,%.5f,%.5f\n", t->next_ms * 1000,
+                v.state.azimuth_deg, v.state.elevation_deg, v.state.pupil_mm, v.state.lid_opening,
+                v.target_azimuth_deg, v.target_elevation_deg);
     }
     fflush(t->file);
 }

@@ -10,7 +10,8 @@ struct person;
 
 struct truth { FILE *file; uint64_t next_ms; };
 
-// Begin a file at the present; a previous one is closed. path NULL: only close. Returns 0, or -1 with errno set.
+// Begin a file at the present; a previous one is closed. path NULL: only close. Returns 0, or -1 with errno
+// set.
 int truth_open(struct truth *truth, const char *path, uint64_t cycle);
 // Write the rows up to a cycle and hand them to the system.
 void truth_write(struct truth *truth, struct person *person, uint64_t cycle);

@@ -194,7 +194,8 @@ static void on_return(avr_irq_t *irq, uint32_t running, void *param)
     access_level(u->avr, u->udre, u->avr->data[UCSR0A] & UDRE);
 }
 
-void uart_attach(struct uart *u, avr_t *avr, struct bridge *bridge, uint64_t seed, double cycles_per_true_second)
+void uart_attach(struct uart *u, avr_t *avr, struct bridge *bridge, uint64_t seed,
+                 double cycles_per_true_second)
 {
     avr_uart_t *stock = (avr_uart_t *)access_module(avr, "uart");
     memset(u, 0, sizeof *u);

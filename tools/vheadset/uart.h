@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // USART0 in asynchronous mode and the line to the USB bridge, replacing libsimavr's.
 //
-// Device    10 bits per byte (8N1; other frames by their own length) at exactly the programmed rate. Transmitter: data
-//           register and shift register (UDRE returns when the byte moves to the shifter, TXC after the last stop
-//           bit). Receiver: two-byte FIFO and the shift register behind it; a start bit while all three are full
-//           loses the byte in the shift register and sets DOR.
-// Line      the bridge sends at the host's speed, one byte after the other, whether the chip listens or not. When the
-//           speeds (clock error included) differ by more than 4 %, or the frame is not 8N1, what arrives on either
-//           side is garbage.
+// Device    10 bits per byte (8N1; other frames by their own length) at exactly the programmed rate.
+//           Transmitter: data register and shift register (UDRE returns when the byte moves to the shifter,
+//           TXC after the last stop bit). Receiver: two-byte FIFO and the shift register behind it; a start
+//           bit while all three are full loses the byte in the shift register and sets DOR.
+// Line      the bridge sends at the host's speed, one byte after the other, whether the chip listens or not.
+//           When the speeds (clock error included) differ by more than 4 %, or the frame is not 8N1, what
+//           arrives on either side is garbage.
 #ifndef UART_H
 #define UART_H
 

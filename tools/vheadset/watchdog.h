@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Watchdog of the ATmega328P, replacing libsimavr's: timed sequence, interrupt and reset modes, WDE held by WDRF. The
-// 128 kHz oscillator is taken as exact. Feeding it costs nothing here, while the stock module files a timer for
-// every WDR, which halves the speed of a program that feeds it in its idle loop.
+// Watchdog of the ATmega328P, replacing libsimavr's: timed sequence, interrupt and reset modes, WDE held by
+// WDRF. The 128 kHz oscillator is taken as exact. Feeding it costs nothing here, while the stock module files
+// a timer for every WDR, which halves the speed of a program that feeds it in its idle loop.
 #ifndef WATCHDOG_H
 #define WATCHDOG_H
 

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The converter and the LEDs on the bench. A command byte from the host starts an experiment; its answer follows.
+// The converter and the LEDs on the bench. A command byte from the host starts an experiment; its answer
+// follows.
 //   'T' ticks16            auto-trigger at OCR1B = ticks, the multiplexer moved on right after: code16
 //   'P'                    one software start: duration16 until ADIF, in cycles
 //   'L'                    started on a high channel, multiplexer moved to a low one: both codes
@@ -7,7 +8,8 @@
 //   'E'                    matches while OCF1B stays set, then after clearing it: conversions seen, two bytes
 //   'I'                    interrupts counted while free running for 10 conversions' time
 //   'X' lit, flags, ticks16, dark16   an exposure of LED 0: code16
-//        flags 1: leave the pull-up on   2: sample capacitor from a low channel   4: lights out at `dark` ticks
+//        flags 1: leave the pull-up on   2: sample capacitor from a low channel   4: lights out at `dark`
+//        ticks
 #include "bench.h"
 
 enum { SLOW = _BV(ADEN) | _BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0) };
@@ -59,7 +61,8 @@ static void triggered(void)
 {
     arm(get16());
     __asm__ volatile("out %[mark], %[one]\n\tsts %[ctl], %[one]"
-                     : : [mark] "I"(_SFR_IO_ADDR(GPIOR1)), [one] "r"((uint8_t)1), [ctl] "i"(_SFR_MEM_ADDR(TCCR1B)));
+                     : : [mark] "I"(_SFR_IO_ADDR(GPIOR1)), [one] "r"((uint8_t)1),
+                       [ctl] "i"(_SFR_MEM_ADDR(TCCR1B)));
     while (!(TIFR1 & _BV(OCF1B)))
         ;
     ADMUX = _BV(REFS0) | 1;
@@ -148,8 +151,9 @@ static void expose(void)
     arm(ticks);
     TCCR1B = _BV(CS10);
     __asm__ volatile("out %[ddr], %[mask]\n\tout %[port], %[value]\n\tout %[mark], %[one]"
-                     : : [ddr] "I"(_SFR_IO_ADDR(DDRC)), [mask] "r"((uint8_t)0x3E), [port] "I"(_SFR_IO_ADDR(PORTC)),
-                       [value] "r"(port), [mark] "I"(_SFR_IO_ADDR(GPIOR1)), [one] "r"((uint8_t)1));
+                     : : [ddr] "I"(_SFR_IO_ADDR(DDRC)), [mask] "r"((uint8_t)0x3E),
+                       [port] "I"(_SFR_IO_ADDR(PORTC)), [value] "r"(port),
+                       [mark] "I"(_SFR_IO_ADDR(GPIOR1)), [one] "r"((uint8_t)1));
     if (flags & 4) {
         while (TCNT1 < dark)
             ;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Receive and data-register interrupts, which are levels: echoes every byte through a ring, in interrupts alone, and
-// takes only one byte per receive interrupt.
+// Receive and data-register interrupts, which are levels: echoes every byte through a ring, in interrupts
+// alone, and takes only one byte per receive interrupt.
 #include "bench.h"
 
 static volatile uint8_t ring[64];

@@ -3,10 +3,10 @@
 //   'E' address16, value, mode   write a byte with EEPM = mode; answers cycles / 16 until EEPE falls, 16 bits
 //   'B' address16, value         begin a write and say 'b' at once
 //   'R' address16                read a byte
-//   'I' address16, value         write, then count ready interrupts in 1 ms while it is busy and in 1 ms after
-//   'M' address16, value         write without EEMPE in time: the byte afterwards
-//   'P' address16, word16        SPM: fill one word of the buffer, write the page (no erase); busy and RWWSB flags seen
-//   'X' address16                SPM: erase a page
+//   'I' address16, value         write, then count ready interrupts in 1 ms while it is busy and in 1 ms
+//   after 'M' address16, value         write without EEMPE in time: the byte afterwards
+//   'P' address16, word16        SPM: fill one word of the buffer, write the page (no erase); busy and RWWSB
+//   flags seen 'X' address16                SPM: erase a page
 //   'F' address16                read flash
 //   'G' address16                read flash while a page erase of 0x5000 runs, then after RWWSRE
 #include "bench.h"

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Senses with LED 0 while the other five light, every 2 ms, and sends the code; answers 'p' with the number of
-// samples so far. The watchdog is fed until 'w' comes.
+// Senses with LED 0 while the other five light, every 2 ms, and sends the code; answers 'p' with the number
+// of samples so far. The watchdog is fed until 'w' comes.
 #include "bench.h"
 
 static void precharge(void)
