@@ -101,6 +101,23 @@ static int blocked(RTCScene scene, const double from[3], const double to[3]) {
     return ray.tfar < 0;
 }
 
+// Share of a spot's area that sees a site, of its four quarters: shadows' edges fall between spots less roughly.
+static float spot_share(RTCScene scene, const struct sim_spot *spot, const double site[3], double step) {
+    double toward[3], length = sqrt(sim_dot(spot->area, spot->area)), from[3];
+    for (int k = 0; k < 3; ++k) toward[k] = site[k] - spot->position[k];
+    if (sim_dot(toward, spot->area) <= 0) return 1;  // sets behind the spot's own horizon: its cosine says so
+    int seen = 0;
+    for (int i = 0; i < 4; ++i) {
+        double dx = (i & 1 ? 0.25 : -0.25) * step, dy = (i & 2 ? 0.25 : -0.25) * step;
+        from[0] = spot->position[0] + dx;
+        from[1] = spot->position[1] + dy;
+        from[2] = spot->position[2] - (spot->area[0] * dx + spot->area[1] * dy) / spot->area[2];
+        for (int k = 0; k < 3; ++k) from[k] += 0.05 * spot->area[k] / length;
+        seen += !blocked(scene, from, site);
+    }
+    return (float)seen / 4;
+}
+
 // Share of the lens at a site seen from a point, over rings of a disc that faces the point.
 static double lens_share(RTCScene scene, const double from[3], const double site[3], double radius) {
     double d[3] = {site[0] - from[0], site[1] - from[1], site[2] - from[2]}, n = sqrt(sim_dot(d, d));
@@ -168,10 +185,8 @@ int sim_face_open(struct sim_face *face, const struct sim_person *person, const 
         for (int i = 0; i < nx; ++i) {
             struct sim_spot *s = &face->spots[j * nx + i];
             spot_at(s, person, X_FROM + (i + 0.5) * step_mm, Y_FROM + (j + 0.5) * step_mm, step_mm);
-            double length = sqrt(sim_dot(s->area, s->area)), from[3];
-            for (int k = 0; k < 3; ++k) from[k] = s->position[k] + 0.05 * s->area[k] / length;
             for (int k = 0; k < n_sites; ++k)
-                face->reach[(j * nx + i) * n_sites + k] = (float)!blocked(scene, from, sites[k]);
+                face->reach[(j * nx + i) * n_sites + k] = spot_share(scene, s, sites[k], step_mm);
         }
     view_eye(face, person, scene, sites, radius_mm);
     rtcReleaseScene(scene);

@@ -9,14 +9,14 @@
 #define PI 3.14159265358979323846
 
 struct sim_quality sim_quality_default(void) {
-    struct sim_quality q = {.lid_alpha = 80,
-                            .lid_beta = 64,
+    struct sim_quality q = {.lid_alpha = 96,
+                            .lid_beta = 56,
                             .iris_ring = 3,
-                            .iris_edge = 14,
+                            .iris_edge = 18,
                             .iris_phi = 64,
                             .glint_theta_deg = 0.5,
                             .glint_lobe = 1.0,
-                            .face_step_mm = 0.3};
+                            .face_step_mm = 0.2};
     return q;
 }
 
