@@ -59,8 +59,9 @@ def test_errors_of_starting_are_one_line_with_a_remedy(monkeypatch, tmp_path):
 
 def test_a_program_that_is_not_the_simulator_is_noticed(monkeypatch, tmp_path):
     monkeypatch.setattr(virtual, "READY_TIMEOUT_S", 0.2)
-    for script, text in (("exit 0", "ended without a word"), ("echo hello; exec sleep 60", "instead of its port"),
-                         ("exec sleep 60", "silent for 0.2 s"), ("echo boom >&2; exit 1", "boom")):
+    for script, text in (
+            ("exit 0", "ended without a word"), ("echo hello; exec sleep 60", "instead of its port"),
+            ("exec sleep 60", "silent for 0.2 s"), ("echo boom >&2; exit 1", "boom")):
         program = tmp_path / "vheadset"
         program.write_text(f"#!/bin/sh\n{script}\n")
         program.chmod(0o755)

@@ -53,7 +53,7 @@ def test_stock_avrdude_flashes_the_same_hex_and_reads_it_back(virtual_nano, firm
     nano = virtual_nano(map=False)
     read = tmp_path / "read.hex"
     for work in (["-D", "-U", f"flash:w:{firmware_hex}:i"], ["-U", f"flash:r:{read}:i"]):
-        # avrdude resets the board once, on opening the port: on a busy host it may then come a second too late.
+        # avrdude resets the board once, on opening the port: on a busy host it may then come too late.
         for turn in range(3):
             done = subprocess.run(["avrdude", "-q", "-q", "-p", "m328p", "-c", "arduino", "-P", nano.port,
                                    "-b", "115200", *work], capture_output=True, text=True)

@@ -6,16 +6,23 @@ import time
 import pytest
 from fake_board import FakeBoard, Printer, PtyPeer
 
+from sparsegaze import device as device_module
 from sparsegaze import wire
-from sparsegaze.device import BOOT_WAIT_S, CONNECT_S, Device
+from sparsegaze.device import BOOT_WAIT_S, Device
 from sparsegaze.errors import NoDeviceError, ProtocolError
 from sparsegaze.wire import lib
+
+
+@pytest.fixture(autouse=True)
+def _impatient(monkeypatch, request):
+    if "stays_silent" not in request.node.name:
+        monkeypatch.setattr(device_module, "BOOT_WAIT_S", 0.1)
 
 
 def test_nothing_behind_the_port_says_so_and_how_to_go_on():
     with PtyPeer() as peer:
         with pytest.raises(NoDeviceError) as caught:
-            Device(peer.port, timeout_s=2.0)
+            Device(peer.port, timeout_s=1.0)
     assert caught.value.message == f"nothing answers on {peer.port}"
     assert "cable" in caught.value.remedy and f"sparsegaze flash {peer.port}" in caught.value.remedy
 
@@ -30,17 +37,17 @@ def test_nothing_behind_the_port_is_tried_at_both_speeds():
     import termios
     with Listener() as peer:
         with pytest.raises(NoDeviceError):
-            Device(peer.port)
+            Device(peer.port, timeout_s=3.1)
         assert set(peer.speeds) == {termios.B1000000, termios.B500000}
         assert peer.speeds[0] == termios.B1000000
         # polite: about four a second
-        assert 4 <= len(peer.speeds) <= (CONNECT_S - BOOT_WAIT_S) / 0.25 + 1
+        assert 4 <= len(peer.speeds) <= 3.0 / 0.25 + 1
 
 
 def test_foreign_firmware_is_told_from_silence_and_its_bytes_are_shown():
     with Printer(b"Hello from a blink sketch\r\n") as peer:
         with pytest.raises(NoDeviceError) as caught:
-            Device(peer.port, timeout_s=2.5)
+            Device(peer.port, timeout_s=1.0)
     assert "not in sparsegaze's protocol" in caught.value.message and "b'Hello" in caught.value.message
     assert f"sparsegaze flash {peer.port}" in caught.value.remedy
     assert "\n" not in str(caught.value)
@@ -49,7 +56,7 @@ def test_foreign_firmware_is_told_from_silence_and_its_bytes_are_shown():
 def test_foreign_firmware_that_sends_delimiters_and_noise_is_foreign():
     with Printer(bytes(range(256)) * 3) as peer:
         with pytest.raises(NoDeviceError, match="not in sparsegaze's protocol"):
-            Device(peer.port, timeout_s=2.5)
+            Device(peer.port, timeout_s=1.0)
 
 
 def test_an_echoing_peer_is_not_taken_for_a_device():
@@ -59,7 +66,7 @@ def test_an_echoing_peer_is_not_taken_for_a_device():
 
     with Echo() as peer:
         with pytest.raises(NoDeviceError):
-            Device(peer.port, timeout_s=2.5)
+            Device(peer.port, timeout_s=1.0)
 
 
 def test_a_device_that_streams_but_does_not_hear_us_points_to_the_wire():
@@ -69,7 +76,7 @@ def test_a_device_that_streams_but_does_not_hear_us_points_to_the_wire():
 
     with Deaf() as peer:
         with pytest.raises(NoDeviceError) as caught:
-            Device(peer.port, timeout_s=2.5)
+            Device(peer.port, timeout_s=1.0)
     assert "answers no request" in caught.value.message and "D0" in caught.value.remedy
 
 
