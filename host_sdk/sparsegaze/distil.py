@@ -33,6 +33,7 @@ NEIGHBOURS, MIXED, BEYOND = 8, 0.7, 0.7
 ROUNDING = (0.5, 0.75, 0.9, 1.0)
 MEAN = "constant"
 FRAMES_EACH = 16            # frames of each fixation that the process is given, noise and all
+LENGTH_MAX = 3.0            # standard deviations of a channel: longer ones do not help, and ask for huge weights
 ROWS_MAX, LEARN_MAX = 2000, 400     # rows of the final process, and of the one whose likelihood is maximised
 CLOUD_EACH = 50
 OUTLIER_SIGMAS, OUTLIER_ROUNDS = 6.0, 3
@@ -381,7 +382,8 @@ def fit_recording(recording, n_vectors=64, seed=0):
     rows = _thin(fixed.frames(max(1, min(FRAMES_EACH, ROWS_MAX // len(fixed.mean)))), ROWS_MAX)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        gp = GaussianProcess.fit(fixed.features[rows], fixed.target_deg[rows], hyper=learnt.hyper, mean=MEAN)
+        gp = GaussianProcess.fit(fixed.features[rows], fixed.target_deg[rows], hyper=learnt.hyper, mean=MEAN,
+                                 noise_scale=fixed.noise_scale()[fixed.label[rows]])
     cloud = fixed.frames(CLOUD_EACH)
     model, report = distil(gp, fixed.features[cloud], fixed.target_deg[cloud], n_vectors, seed, fixed.noise)
     return FitResult(gp, model, FitReport(
@@ -393,7 +395,8 @@ def fit_recording(recording, n_vectors=64, seed=0):
 
 def _learn(fixed, seed):
     rows = _thin(np.arange(len(fixed.mean)), LEARN_MAX)
-    return GaussianProcess.fit(fixed.mean[rows], fixed.target[rows], mean=MEAN, seed=seed)
+    return GaussianProcess.fit(fixed.mean[rows], fixed.target[rows], fixed.noise_scale()[rows], mean=MEAN, seed=seed,
+                               length_max=LENGTH_MAX)
 
 
 def _thin(rows, most):

@@ -16,6 +16,8 @@ MOVE_DEG = 0.5                  # a target that has moved on by this much is ano
 GAP_US = 2_000_000              # and so is the same target after such a pause
 BLINK_SIGMAS = 6.0
 FEW_FRAMES = 8                  # fewer frames than this have no spread to judge by
+NOISE_SHARE, BIAS_DEG = 0.45, 0.3
+NEIGHBOURS, SCALE_MAX = 14, 300.0
 STEADY_FLOOR = 8.0              # feature steps; quantised noise-free recordings have a MAD of 0
 
 
@@ -51,6 +53,27 @@ class Fixations:
         rows = [start + np.unique(np.floor((np.arange(min(each, n)) + 0.5) * n / min(each, n)).astype(int))
                 for start, n in zip(starts, counts)]
         return np.concatenate(rows)
+
+    def noise_scale(self):
+        """How much noisier than others each fixation is as an observation of gaze: [k], relative variance, >= 1.
+
+        Where all channels are flat, a small disturbance of the features (pupil, lids) is a large one of gaze. The
+        features' slope comes from a plane through each target and its neighbours; NOISE_SHARE of a frame's noise stands
+        for the disturbance of a mean, BIAS_DEG for the eye's own part. Noise that is told apart lets the likelihood
+        choose longer or shorter length scales for the sake of the fixations that count.
+        """
+        disturbance2 = float(np.mean((NOISE_SHARE * self.noise) ** 2))
+        if disturbance2 == 0.0:
+            return np.ones(len(self.target))
+        scale = np.empty(len(self.target))
+        for i, place in enumerate(self.target):
+            distance = ((self.target - place) ** 2).sum(axis=1)
+            near = np.argsort(distance, kind="stable")[:NEIGHBOURS]
+            plane = np.column_stack([np.ones(len(near)), self.target[near] - place])
+            slope = np.linalg.lstsq(plane, self.mean[near], rcond=None)[0][1:]
+            gaze2 = np.trace(np.linalg.inv(slope @ slope.T + 1e-3 * np.eye(2))) / 2
+            scale[i] = min(1.0 + disturbance2 * gaze2 / BIAS_DEG ** 2, SCALE_MAX)
+        return scale
 
 
 def fixations(recording):

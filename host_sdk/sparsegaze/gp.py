@@ -61,12 +61,13 @@ class GaussianProcess:
 
     @classmethod
     def fit(cls, features, gaze_deg, noise_scale=None, groups=None, mean="linear", hyper=None, restarts=2, seed=0,
-            group_noise=False):
+            group_noise=False, length_max=LENGTH_RANGE[1]):
         """Fit to features [n, d] and gaze_deg [n, 2].
 
         noise_scale   [n] relative noise variance of each sample (default 1)
         groups        int [n], samples that share one error; used when group_noise, or hyper.group_deg > 0
         hyper         use these parameters instead of optimising the likelihood
+        length_max    longest length scale, in standard deviations of the channel
         restarts      random starting points beside the standard one; the result is a pure function of data and seed
         Samples are put in a canonical order first, so that their order does not matter.
         Raises CalibrationError for fewer samples than the mean needs, for nan or infinities, and when all channels are
@@ -95,7 +96,7 @@ class GaussianProcess:
         x, y, scale, labels = x[order], y[order], scale[order], labels[order]
         gp = cls(x, y, hyper, mean, scale, labels, dropped)
         if hyper is None:
-            gp.hyper = _optimise(gp, varying, restarts, seed, group_noise)
+            gp.hyper = _optimise(gp, varying, restarts, seed, group_noise, length_max)
         gp._solve(varying)
         return gp
 
@@ -193,7 +194,7 @@ def _mean_columns(mean, channels):
         raise ValueError(f"mean {mean!r} is none of zero, constant, linear") from None
 
 
-def _optimise(gp, varying, restarts, seed, group_noise):
+def _optimise(gp, varying, restarts, seed, group_noise, length_max):
     """Maximise the marginal likelihood over log length, signal, noise (and group) deviations."""
     x = gp.x[:, varying]
     spread = x.std(axis=0)
@@ -203,13 +204,13 @@ def _optimise(gp, varying, restarts, seed, group_noise):
     h = {"zero": np.empty((n, 0)), "constant": np.ones((n, 1)), "linear": np.hstack([np.ones((n, 1)), z])}[gp.mean]
     squares = np.stack([(z[:, j, None] - z[:, j]) ** 2 for j in range(d)])
     same = (gp.groups[:, None] == gp.groups).astype(float) if group_noise else None
-    bounds = np.log([LENGTH_RANGE] * d + [SIGNAL_RANGE, NOISE_RANGE] + [NOISE_RANGE] * bool(group_noise))
+    bounds = np.log([(LENGTH_RANGE[0], length_max)] * d + [SIGNAL_RANGE, NOISE_RANGE] + [NOISE_RANGE] * bool(group_noise))
 
     def objective(theta):
         value, slope = _likelihood(theta, squares, y, h, gp.noise_scale, same)
         return -value, -slope
 
-    start = np.log(np.r_[np.full(d, 3.0), 3.0, 0.05, [0.03] * bool(group_noise)])
+    start = np.log(np.r_[np.full(d, min(3.0, 0.7 * length_max)), 3.0, 0.05, [0.03] * bool(group_noise)])
     rng = np.random.default_rng([0x6770, seed])
     best = None
     for trial in range(restarts + 1):
