@@ -15,12 +15,13 @@ import tempfile
 import serial
 
 REPO = pathlib.Path(__file__).resolve().parent.parent.parent
-PROGRAM = REPO / "tools" / "vheadset" / "vheadset"
-PHYSICS = REPO / "tools" / "vheadset" / "physics.toml"
+FOLDER = REPO / "tools" / "vheadset"
+PROGRAM = pathlib.Path(os.environ.get("SPARSEGAZE_VHEADSET", FOLDER / "vheadset"))    # e.g. one with sanitizers
+PHYSICS = FOLDER / "physics.toml"
 SOURCES = pathlib.Path(__file__).resolve().parent / "firmware"
 BUILD = REPO / "build" / "nano"
 BOOTLOADERS = pathlib.Path("/usr/share/arduino/hardware/arduino/avr/bootloaders")
-OPTIBOOT = PROGRAM.parent / "bootloaders" / "optiboot" / "optiboot_atmega328.hex"
+OPTIBOOT = FOLDER / "bootloaders" / "optiboot" / "optiboot_atmega328.hex"
 ATMEGABOOT = BOOTLOADERS / "atmega" / "ATmegaBOOT_168_atmega328.hex"
 
 # Everything that draws noise or differs from part to part.
@@ -113,12 +114,11 @@ class Board:
             self.port.close()
         if self.process.poll() is None:
             self.process.terminate()
-        self.process.wait(20)
-        self.process.stdout.close()
-        self.process.stderr.close()
+        complaint = self.process.communicate(timeout=60)[1]
         self.replies.close()
         self.control.close()
         shutil.rmtree(self.folder, ignore_errors=True)
+        assert self.process.returncode == 0 and not complaint, complaint
 
     def open(self, baud=None):
         """Open the port as a client does."""

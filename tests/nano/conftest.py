@@ -5,11 +5,11 @@ import subprocess
 
 import pytest
 
-from board import PROGRAM
+from board import FOLDER, PROGRAM
 
 
 @pytest.fixture(scope="session", autouse=True)
 def vheadset():
     """Path of the built program."""
-    subprocess.run(["make", "-s", "-C", PROGRAM.parent], check=True, timeout=300)
+    subprocess.run(["make", "-s", "-C", FOLDER], check=True, timeout=300)
     return PROGRAM
