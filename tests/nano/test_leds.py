@@ -190,3 +190,17 @@ def test_emitters_weaken_when_warm(flat_map):
         _, seconds, _, held = exposure(board, lit=0b111110, ticks=3000)
     collected = charge_pc(VOLTS, SAMPLER) - charge_pc(held, SAMPLER)
     assert collected == pytest.approx(0.95 * 200e-9 * seconds * 1e12, rel=1e-9)
+
+
+@pytest.mark.parametrize("ambient,mean_na,share", [("room", 20, 0.3), ("bright_room", 200, 0.5)])
+def test_ambient_light_flickers_with_the_mains(ambient, mean_na, share):
+    currents = []
+    with bench() as board:
+        board.command(f"set ambient {ambient}")
+        for _ in range(100):
+            _, seconds, _, held = exposure(board, ticks=2000)
+            collected = charge_pc(VOLTS, SAMPLER) - charge_pc(held, SAMPLER)
+            currents.append(collected * 1e-3 / seconds)
+            board.run(137)                  # so that the samples sweep the phase of 100 or 120 Hz
+    assert min(currents) == pytest.approx(mean_na * (1 - share), rel=0.05)
+    assert max(currents) == pytest.approx(mean_na * (1 + share), rel=0.05)
