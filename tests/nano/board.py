@@ -16,7 +16,8 @@ import serial
 
 REPO = pathlib.Path(__file__).resolve().parent.parent.parent
 FOLDER = REPO / "tools" / "vheadset"
-PROGRAM = pathlib.Path(os.environ.get("SPARSEGAZE_VHEADSET", FOLDER / "vheadset"))    # e.g. one with sanitizers
+# another one may be tried, built with sanitizers for instance
+PROGRAM = pathlib.Path(os.environ.get("SPARSEGAZE_VHEADSET", FOLDER / "vheadset"))
 PHYSICS = FOLDER / "physics.toml"
 SOURCES = pathlib.Path(__file__).resolve().parent / "firmware"
 BUILD = REPO / "build" / "nano"

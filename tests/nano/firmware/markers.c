@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Sections of known length: 0 empty, 1 ten NOPs, 2 ten NOPs with an interrupt of known length among them, 3 the
-// interrupt itself, from its own first instruction. Then two frame marks and a zero byte.
+// Sections of known length: 0 empty, 1 ten NOPs, 2 ten cycles with an interrupt of known length among them,
+// 3 the interrupt itself, from its own first instruction. Then two frame marks and a zero byte.
 #include "bench.h"
 
 #define BEGIN(k) "ldi r24, 2 * " #k " + 1\n\tout %[mark], r24\n\t"
