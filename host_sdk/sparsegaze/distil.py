@@ -278,13 +278,16 @@ def reach(weights, trend, bias, centres, rails):
     length = U_STEPS * S_FRAC
     columns = np.linalg.inv(rows) / length
     extent = np.linalg.norm(columns, axis=0) * (high - low)
-    cuts = np.maximum(1, np.ceil(extent / CELL)).astype(int)
-    while np.prod(cuts.astype(float)) > CELLS_MAX:
-        cuts[np.argmax(extent / cuts)] -= 1
+    cell = CELL
+    while np.prod(np.ceil(extent / cell)) > CELLS_MAX:
+        cell *= 1.1
+    cuts = np.ceil(extent / cell).astype(int)
     parts = [lo + (np.arange(cut) + 0.5) * (hi - lo) / cut for lo, hi, cut in zip(low, high, cuts)]
     middle = np.stack([g.ravel() for g in np.meshgrid(*parts, indexing="ij")], axis=1) @ columns.T
     half = columns * (high - low) / (2 * cuts)
     size2 = np.abs(half.T @ half).sum()
+    overlap = np.abs(half).sum(axis=1)          # cells outside the box hold no input
+    middle = middle[((middle > -overlap) & (middle < S_MAX / length + overlap)).all(axis=1)]
     spot = centres[:, live] / U_STEPS
     gram = np.exp(-0.5 * ((spot[:, None] - spot) ** 2).sum(-1))
     norm = np.sqrt(np.maximum(np.einsum("io,ij,jo->o", weights.astype(float), gram, weights.astype(float)), 0.0))
@@ -382,7 +385,7 @@ def fit_recording(recording, n_vectors=64, seed=0):
     rows = _thin(fixed.frames(max(1, min(FRAMES_EACH, ROWS_MAX // len(fixed.mean)))), ROWS_MAX)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        gp = GaussianProcess.fit(fixed.features[rows], fixed.target_deg[rows], hyper=learnt.hyper, mean=MEAN,
+        gp = GaussianProcess.fit(*spread_out(fixed, rows, seed), hyper=learnt.hyper, mean=MEAN,
                                  noise_scale=fixed.noise_scale()[fixed.label[rows]])
     cloud = fixed.frames(CLOUD_EACH)
     model, report = distil(gp, fixed.features[cloud], fixed.target_deg[cloud], n_vectors, seed, fixed.noise)
@@ -391,6 +394,26 @@ def fit_recording(recording, n_vectors=64, seed=0):
         float(np.sqrt(np.mean(np.sum((learnt.y - predicted) ** 2, axis=1)))), learnt.lml, learnt.condition,
         learnt.jitter, [float(v) for v in learnt.hyper.length], learnt.hyper.signal_deg, learnt.hyper.noise_deg, learnt.dropped,
         report))
+
+
+def spread_out(fixed, rows, seed):
+    """Frames `rows` of the Fixations, each moved to a place near its target: (features [n, d], gaze [n, 2]).
+
+    Targets stand some degrees apart, and the features bend between them (the ring of the limbus is 2 degrees wide). The
+    map from gaze to features is smooth and two-dimensional, so that far fewer points tell it than its inverse: frames
+    are moved along it by up to half the distance between targets, noise and pupil included.
+    """
+    target, place = fixed.target_deg[rows], fixed.target
+    low, high = place.min(axis=0), place.max(axis=0)
+    reach_deg = 0.5 * np.sqrt(np.prod(np.maximum(high - low, 1e-6)) / len(place))
+    rng = np.random.default_rng([0x6D6F76, seed])
+    moved = np.clip(target + rng.uniform(-reach_deg, reach_deg, target.shape), low, high)
+    features = fixed.features[rows].copy()
+    for pair in np.array_split(np.arange(features.shape[1]), (features.shape[1] + 1) // 2):
+        forward = GaussianProcess.fit(place, fixed.mean[:, [pair[0], pair[-1]]], mean=MEAN, length_max=LENGTH_MAX)
+        step = forward.predict(moved) - forward.predict(target)
+        features[:, pair] += step[:, :len(pair)]
+    return features, moved
 
 
 def _learn(fixed, seed):
