@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole calibration: targets -> recording -> Gaussian process -> device model -> upload -> validation."""
+
 import json
 import os
 from dataclasses import dataclass
@@ -13,8 +14,9 @@ RECORDING, MODEL, REPORT = "recording.csv", "model.sgm", "report.json"
 
 @dataclass
 class Calibration:
-    """capture (capture.Capture), fit (distil.FitResult), upload (store.UploadReport or None), validation (or None),
-    folder (where recording, model and report are kept, or None)."""
+    """capture (capture.Capture), fit (distil.FitResult), upload (store.UploadReport or None), validation (or
+    None), folder (where recording, model and report are kept, or None).
+    """
 
     capture: capture.Capture
     fit: object
@@ -26,27 +28,47 @@ class Calibration:
         """Everything as one dict of plain values."""
         chosen, model = self.capture.selection, self.fit.model
         out = {
-            "n_targets": chosen.n_targets, "used_targets": chosen.used_targets,
+            "n_targets": chosen.n_targets,
+            "used_targets": chosen.used_targets,
             "frames": {"valid": int(chosen.valid.sum()), **chosen.counts()},
             "recording_lost": self.capture.run.lost,
-            "n_vectors": model.vectors, "fit": plain(self.fit.report), "crc_host": model.crc,
-            "notes": list(self.capture.run.notes)}
+            "n_vectors": model.vectors,
+            "fit": plain(self.fit.report),
+            "crc_host": model.crc,
+            "notes": list(self.capture.run.notes),
+        }
         if self.upload is not None:
             # The upload gives the model its generation, which the checksum covers.
             out.update(upload=plain(self.upload), crc_host=self.upload.crc)
         if self.validation is not None:
             measured = self.validation.report()
-            out.update(accuracy=measured["accuracy"], stream=measured["stream"], crc_device=measured["model_crc"],
-                       validation_targets=measured["targets"],
-                       data_loss_percent=measured["accuracy"]["data_loss_percent"])
+            out.update(
+                accuracy=measured["accuracy"],
+                stream=measured["stream"],
+                crc_device=measured["model_crc"],
+                validation_targets=measured["targets"],
+                data_loss_percent=measured["accuracy"]["data_loss_percent"],
+            )
             out["notes"] += measured["notes"]
         if self.folder:
             out["files"] = {name: os.path.join(self.folder, name) for name in (RECORDING, MODEL, REPORT)}
         return out
 
 
-def run(port, n_targets=120, vectors=64, seed=0, n_validation=25, folder=None, upload=True, screen=None, window=None,
-        csv=None, truth=True, progress=None):
+def run(
+    port,
+    n_targets=120,
+    vectors=64,
+    seed=0,
+    n_validation=25,
+    folder=None,
+    upload=True,
+    screen=None,
+    window=None,
+    csv=None,
+    truth=True,
+    progress=None,
+):
     """Calibrate the device behind `port` and return a Calibration.
 
     port          port name
@@ -73,7 +95,11 @@ def run(port, n_targets=120, vectors=64, seed=0, n_validation=25, folder=None, u
         try:
             plan = targets.calibration_plan(n_targets, seed, reach_deg=shown.reach_deg())
             path = os.path.join(folder, RECORDING) if folder else None
-            meta = {"device": device.hello.board_text, "firmware": device.hello.firmware_text, "plan_seed": seed}
+            meta = {
+                "device": device.hello.board_text,
+                "firmware": device.hello.firmware_text,
+                "plan_seed": seed,
+            }
             taken = capture.run(device, shown, plan, path, meta, progress)
             try:
                 capture.check(taken)
@@ -90,9 +116,12 @@ def run(port, n_targets=120, vectors=64, seed=0, n_validation=25, folder=None, u
                     if folder:
                         fitted.model.with_generation(done.upload.generation).save(os.path.join(folder, MODEL))
                     if n_validation:
-                        held_out = targets.validation_plan(n_validation, seed, reach_deg=shown.reach_deg(),
-                                                           avoid_deg=plan.target_deg)
-                        done.validation = validate.measure(Device(link), shown, held_out, csv, truth, progress)
+                        held_out = targets.validation_plan(
+                            n_validation, seed, reach_deg=shown.reach_deg(), avoid_deg=plan.target_deg
+                        )
+                        done.validation = validate.measure(
+                            Device(link), shown, held_out, csv, truth, progress
+                        )
                 _write_report(done)
                 return done
             except SparsegazeError as error:
@@ -109,7 +138,11 @@ def plain(value):
     if hasattr(value, "_asdict"):
         return plain(value._asdict())
     if hasattr(value, "__dataclass_fields__"):
-        return {name: plain(getattr(value, name)) for name in value.__dataclass_fields__ if not name.startswith("_")}
+        return {
+            name: plain(getattr(value, name))
+            for name in value.__dataclass_fields__
+            if not name.startswith("_")
+        }
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if hasattr(value, "tolist"):
@@ -128,7 +161,9 @@ def _make(folder):
         try:
             os.makedirs(folder, exist_ok=True)
         except OSError as error:
-            raise CalibrationError(f"cannot make {folder}: {error.strerror}", "choose another place with --save") from None
+            raise CalibrationError(
+                f"cannot make {folder}: {error.strerror}", "choose another place with --save"
+            ) from None
 
 
 def _write_report(done):
@@ -141,4 +176,6 @@ def _write_report(done):
             file.write("\n")
         os.replace(path + ".part", path)
     except OSError as error:
-        raise CalibrationError(f"cannot write {path}: {error.strerror}", "choose another place with --save") from None
+        raise CalibrationError(
+            f"cannot write {path}: {error.strerror}", "choose another place with --save"
+        ) from None

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The `sparsegaze` command. Commands live in cli_device.py and cli_gaze.py and are imported when they are called.
+"""The `sparsegaze` command. Commands live in cli_device.py, cli_gaze.py and cli_stream.py.
 
-Exit codes: 0 done; 1 failed (one line on stderr: what is wrong, and the remedy); 2 wrong usage; 130 interrupted by
-Ctrl-C, 143 by SIGTERM. No traceback reaches the user; SPARSEGAZE_DEBUG=1 lets it through.
+Exit codes: 0 done; 1 failed (one line on stderr: what is wrong, and the remedy); 2 wrong usage; 130
+interrupted by Ctrl-C, 143 by SIGTERM. No traceback reaches the user; SPARSEGAZE_DEBUG=1 lets it through.
 """
+
 import importlib
 import json
 import os
@@ -29,8 +30,8 @@ COMMANDS = {
     "upload": ("cli_device", "Put a model into the device, safe against power cuts."),
     "validate": ("cli_gaze", "Measure the device's gaze on held-out targets."),
     "recentre": ("cli_gaze", "Put a shifted headset right with one look at the centre."),
-    "stream": ("cli_gaze", "The gaze computed on the device, live."),
-    "replay": ("cli_gaze", "The device's arithmetic on the host, over a recording, to the bit."),
+    "stream": ("cli_stream", "The gaze computed on the device, live."),
+    "replay": ("cli_stream", "The device's arithmetic on the host, over a recording, to the bit."),
 }
 
 
@@ -50,6 +51,7 @@ class Commands(click.Group):
         name = args[0] if args else ""
         if name not in COMMANDS and not name.startswith("-"):
             import difflib
+
             near = difflib.get_close_matches(name, COMMANDS, 1)
             ctx.fail(f"no command {name!r}" + (f", did you mean {near[0]}?" if near else ""))
         return super().resolve_command(ctx, args)
@@ -59,7 +61,9 @@ class Commands(click.Group):
             formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
 
 
-@click.command(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.command(
+    cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+)
 @click.version_option(__version__, prog_name="sparsegaze")
 def cli():
     """Gaze from six LEDs, computed on the microcontroller that reads them.
@@ -72,8 +76,9 @@ def cli():
         sparsegaze stream /tmp/nano --seconds 20 --csv gaze.csv
     With a real Nano: the same, with its own port (sparsegaze list shows it).
 
-    PORT is a name such as /dev/ttyUSB0, COM3 or the one that `virtual` prints. Angles are degrees, azimuth + right,
-    elevation + up. Every command has its own --help and, with --json, prints one JSON object on stdout.
+    PORT is a name such as /dev/ttyUSB0, COM3 or the one that `virtual` prints. Angles are degrees, azimuth +
+    right, elevation + up. Every command has its own --help and, with --json, prints one JSON object on
+    stdout.
     """
 
 
@@ -111,10 +116,15 @@ def run(args):
             return _fail(as_json, error.message, error.remedy, 1)
         except (KeyboardInterrupt, click.Abort) as error:
             terminated = isinstance(error, Terminated)
-            return _fail(as_json, "terminated" if terminated else "interrupted", "what was written so far is complete",
-                         143 if terminated else 130)
+            return _fail(
+                as_json,
+                "terminated" if terminated else "interrupted",
+                "what was written so far is complete",
+                143 if terminated else 130,
+            )
         except BrokenPipeError:
-            # The reader of our output has gone; let the interpreter's own flush at exit find nothing to complain of.
+            # The reader of our output has gone; let the interpreter's own flush at exit find nothing to
+            # complain of.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 1
         except Exception as error:
@@ -127,12 +137,25 @@ def run(args):
 
 def _unexpected(as_json, error):
     if isinstance(error, ImportError):
-        return _fail(as_json, f"a part of sparsegaze cannot be loaded ({error})", "sparsegaze doctor says what is missing", 1)
+        return _fail(
+            as_json,
+            f"a part of sparsegaze cannot be loaded ({error})",
+            "sparsegaze doctor says what is missing",
+            1,
+        )
     if isinstance(error, OSError) and error.strerror:
-        return _fail(as_json, f"{error.strerror}" + (f": {error.filename}" if error.filename else ""),
-                     "check the place and the free space there", 1)
-    return _fail(as_json, f"internal error ({type(error).__name__}: {error})",
-                 "this is a bug: run again with SPARSEGAZE_DEBUG=1 and report what it prints", 1)
+        return _fail(
+            as_json,
+            f"{error.strerror}" + (f": {error.filename}" if error.filename else ""),
+            "check the place and the free space there",
+            1,
+        )
+    return _fail(
+        as_json,
+        f"internal error ({type(error).__name__}: {error})",
+        "this is a bug: run again with SPARSEGAZE_DEBUG=1 and report what it prints",
+        1,
+    )
 
 
 def _fail(as_json, message, remedy, code):
@@ -158,7 +181,7 @@ def _terminate(number, frame):
 def _on_terminate(handler):
     try:
         return signal.signal(signal.SIGTERM, handler)
-    except ValueError:      # not in the main thread (tests): whoever runs us deals with signals
+    except ValueError:  # not in the main thread (tests): whoever runs us deals with signals
         return None
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands about gaze: calibrate, record, fit, validate, recentre, stream, replay."""
+"""Commands with targets: calibrate, record, fit, validate, recentre."""
+
 import contextlib
 import os
-import sys
 import time
 
 import click
@@ -16,11 +16,22 @@ VECTORS = click.IntRange(1, 216)
 def screen_options(command):
     """--distance-mm, --width-mm, --windowed: the screen of a real device; a simulated person needs none."""
     for option in (
-            click.option("--windowed", is_flag=True, help="Show targets in a window instead of full screen."),
-            click.option("--width-mm", type=click.FloatRange(1.0, 10000.0), default=530.0, show_default=True,
-                         help="Width of the screen's picture, mm. Real device only."),
-            click.option("--distance-mm", type=click.FloatRange(1.0, 100000.0), default=600.0, show_default=True,
-                         help="Distance from the eye to the screen, mm. Real device only.")):
+        click.option("--windowed", is_flag=True, help="Show targets in a window instead of full screen."),
+        click.option(
+            "--width-mm",
+            type=click.FloatRange(1.0, 10000.0),
+            default=530.0,
+            show_default=True,
+            help="Width of the screen's picture, mm. Real device only.",
+        ),
+        click.option(
+            "--distance-mm",
+            type=click.FloatRange(1.0, 100000.0),
+            default=600.0,
+            show_default=True,
+            help="Distance from the eye to the screen, mm. Real device only.",
+        ),
+    ):
         command = option(command)
     return command
 
@@ -32,6 +43,7 @@ def _window(distance_mm, width_mm, windowed):
 @contextlib.contextmanager
 def _screen(device, window):
     from .screen import screen_for
+
     shown = screen_for(device, **window)
     try:
         yield shown
@@ -41,69 +53,133 @@ def _screen(device, window):
 
 def _accuracy_lines(report):
     accuracy, stream = report["accuracy"], report["stream"]
-    items = [("error to target", f"mean {accuracy['mean_deg']:.2f}, median {accuracy['median_deg']:.2f}, 95 % "
-              f"{accuracy['p95_deg']:.2f} deg, per frame"),
-             ("accuracy", f"{accuracy['accuracy_deg']:.2f} deg (of the mean gaze per target)"),
-             ("precision", f"{accuracy['rms_s2s_deg']:.3f} deg RMS-S2S, {accuracy['std_deg']:.3f} deg STD"),
-             ("data loss", f"{accuracy['data_loss_percent']:.1f} % of the settled frames")]
+    items = [
+        (
+            "error to target",
+            f"mean {accuracy['mean_deg']:.2f}, median {accuracy['median_deg']:.2f}, 95 % "
+            f"{accuracy['p95_deg']:.2f} deg, per frame",
+        ),
+        ("accuracy", f"{accuracy['accuracy_deg']:.2f} deg (of the mean gaze per target)"),
+        ("precision", f"{accuracy['rms_s2s_deg']:.3f} deg RMS-S2S, {accuracy['std_deg']:.3f} deg STD"),
+        ("data loss", f"{accuracy['data_loss_percent']:.1f} % of the settled frames"),
+    ]
     if "to_true_gaze_mean_deg" in accuracy:
-        items.append(("error to true gaze", f"mean {accuracy['to_true_gaze_mean_deg']:.2f} deg (where the simulated eye "
-                                            "really looked)"))
-    items += [("stream", f"{stream['frames']} frames, {stream['rate_hz']:.1f} Hz, {stream['lost']} lost"),
-              ("host and device", f"bit-identical on {stream['compared']} frames" if stream["bit_identical"] else
-               f"DIFFER in {stream['differing']} of {stream['compared']} frames")]
+        items.append(
+            (
+                "error to true gaze",
+                f"mean {accuracy['to_true_gaze_mean_deg']:.2f} deg (where the simulated eye "
+                "really looked)",
+            )
+        )
+    items += [
+        ("stream", f"{stream['frames']} frames, {stream['rate_hz']:.1f} Hz, {stream['lost']} lost"),
+        (
+            "host and device",
+            (
+                f"bit-identical on {stream['compared']} frames"
+                if stream["bit_identical"]
+                else f"DIFFER in {stream['differing']} of {stream['compared']} frames"
+            ),
+        ),
+    ]
     return pairs(items)
 
 
 @click.command()
 @port_argument
-@click.option("--targets", "n_targets", type=click.IntRange(9, 1000), default=120, show_default=True,
-              help="Calibration targets, about one second each.")
-@click.option("--vectors", type=VECTORS, default=64, show_default=True, help="Calibration vectors of the device's model.")
-@click.option("--validation", "n_validation", type=click.IntRange(0, 1000), default=25, show_default=True,
-              help="Held-out targets afterwards; 0 for none.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the target positions.")
-@click.option("--save", type=click.Path(file_okay=False), help="Folder for recording.csv, model.sgm and report.json."
-              "  [default: calibrations/<date>-<time>]")
+@click.option(
+    "--targets",
+    "n_targets",
+    type=click.IntRange(9, 1000),
+    default=120,
+    show_default=True,
+    help="Calibration targets, about one second each.",
+)
+@click.option(
+    "--vectors",
+    type=VECTORS,
+    default=64,
+    show_default=True,
+    help="Calibration vectors of the device's model.",
+)
+@click.option(
+    "--validation",
+    "n_validation",
+    type=click.IntRange(0, 1000),
+    default=25,
+    show_default=True,
+    help="Held-out targets afterwards; 0 for none.",
+)
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the target positions."
+)
+@click.option(
+    "--save",
+    type=click.Path(file_okay=False),
+    help="Folder for recording.csv, model.sgm and report.json." "  [default: calibrations/<date>-<time>]",
+)
 @screen_options
 @json_option
 def calibrate(port, n_targets, vectors, n_validation, seed, save, distance_mm, width_mm, windowed, as_json):
-    """Show targets, record, fit, upload the model and validate it: the whole calibration of the device at PORT.
+    """Show targets, record, fit, upload the model and validate it: the whole calibration of the device at
+    PORT.
 
-    Look at each dot until it moves; blink while it moves. A simulated person does so by itself. Targets cover +-22 deg
-    (or what the screen allows). The recording is kept whatever happens later, so nothing has to be looked at twice.
+    Look at each dot until it moves; blink while it moves. A simulated person does so by itself. Targets cover
+    +-22 deg (or what the screen allows). The recording is kept whatever happens later, so nothing has to be
+    looked at twice.
 
     \b
     Example:
         sparsegaze calibrate /dev/ttyUSB0 --distance-mm 550 --width-mm 598
     """
     from . import calibrate as module
+
     console = Console(as_json)
     folder = save or os.path.join("calibrations", time.strftime("%Y%m%d-%H%M%S"))
     with console.progress() as progress:
-        done = module.run(port, n_targets, vectors, seed, n_validation, folder,
-                          window=_window(distance_mm, width_mm, windowed), progress=progress)
+        done = module.run(
+            port,
+            n_targets,
+            vectors,
+            seed,
+            n_validation,
+            folder,
+            window=_window(distance_mm, width_mm, windowed),
+            progress=progress,
+        )
     report = done.report()
     for note in report["notes"]:
         console.warn(note)
-    lines = pairs([("targets", f"{report['used_targets']} of {report['n_targets']} used"),
-                   ("model", f"{report['n_vectors']} vectors, crc 0x{report['crc_host']:08X}, kept in {folder}")])
+    lines = pairs(
+        [
+            ("targets", f"{report['used_targets']} of {report['n_targets']} used"),
+            ("model", f"{report['n_vectors']} vectors, crc 0x{report['crc_host']:08X}, kept in {folder}"),
+        ]
+    )
     console.result(report, *lines, *(_accuracy_lines(report) if "accuracy" in report else []))
 
 
 @click.command()
 @port_argument
 @click.option("-o", "--output", type=click.Path(dir_okay=False), required=True, help="CSV file to write.")
-@click.option("--targets", "n_targets", type=click.IntRange(9, 1000), default=120, show_default=True,
-              help="Targets, about one second each.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the target positions.")
+@click.option(
+    "--targets",
+    "n_targets",
+    type=click.IntRange(9, 1000),
+    default=120,
+    show_default=True,
+    help="Targets, about one second each.",
+)
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the target positions."
+)
 @screen_options
 @json_option
 def record(port, output, n_targets, seed, distance_mm, width_mm, windowed, as_json):
     """Record raw features with targets: t_us, s0..s5, target_az_deg, target_el_deg, valid.
 
-    Features are log2 photocurrents, 4096 steps per octave. Frames of settling eyes and blinks stay in the file with
-    valid 0. Ctrl-C leaves a complete file of the targets so far.
+    Features are log2 photocurrents, 4096 steps per octave. Frames of settling eyes and blinks stay in the
+    file with valid 0. Ctrl-C leaves a complete file of the targets so far.
 
     \b
     Example:
@@ -111,6 +187,7 @@ def record(port, output, n_targets, seed, distance_mm, width_mm, windowed, as_js
     """
     from . import capture, targets
     from .device import Device
+
     console = Console(as_json)
     with Device(port) as device, _screen(device, _window(distance_mm, width_mm, windowed)) as shown:
         plan = targets.calibration_plan(n_targets, seed, reach_deg=shown.reach_deg())
@@ -121,17 +198,28 @@ def record(port, output, n_targets, seed, distance_mm, width_mm, windowed, as_js
     for note in taken.run.notes:
         console.warn(note)
     counts = chosen.counts()
-    console.result({"file": output, "n_targets": chosen.n_targets, "used_targets": chosen.used_targets,
-                    "frames": {"all": len(taken.recording), **counts}, "lost": taken.run.lost,
-                    "rate_hz": taken.run.rate_hz},
-                   f"{output}: {len(taken.recording)} frames, {counts.get('used', 0)} valid, {chosen.used_targets} of "
-                   f"{chosen.n_targets} targets, {taken.run.lost} lost")
+    console.result(
+        {
+            "file": output,
+            "n_targets": chosen.n_targets,
+            "used_targets": chosen.used_targets,
+            "frames": {"all": len(taken.recording), **counts},
+            "lost": taken.run.lost,
+            "rate_hz": taken.run.rate_hz,
+        },
+        f"{output}: {len(taken.recording)} frames, {counts.get('used', 0)} valid, {chosen.used_targets} of "
+        f"{chosen.n_targets} targets, {taken.run.lost} lost",
+    )
 
 
 @click.command()
 @click.argument("file", type=click.Path(dir_okay=False))
-@click.option("-o", "--output", type=click.Path(dir_okay=False), help="Model file to write.  [default: FILE with .sgm]")
-@click.option("--vectors", type=VECTORS, default=64, show_default=True, help="Calibration vectors of the model.")
+@click.option(
+    "-o", "--output", type=click.Path(dir_okay=False), help="Model file to write.  [default: FILE with .sgm]"
+)
+@click.option(
+    "--vectors", type=VECTORS, default=64, show_default=True, help="Calibration vectors of the model."
+)
 @json_option
 def fit(file, output, vectors, as_json):
     """Make a model from a recording: a Gaussian process in float64, distilled to VECTORS fixed-point vectors.
@@ -145,6 +233,7 @@ def fit(file, output, vectors, as_json):
     from .calibrate import plain
     from .distil import fit_recording
     from .recording import Recording
+
     console = Console(as_json)
     recording = Recording.read(file)
     with console.progress() as progress:
@@ -154,8 +243,11 @@ def fit(file, output, vectors, as_json):
     output = output or os.path.splitext(file)[0] + ".sgm"
     fitted.model.save(output)
     report = plain(fitted.report)
-    console.result({"file": output, "n_vectors": fitted.model.vectors, "crc": fitted.model.crc, "report": report},
-                   f"{output}: {fitted.model.vectors} vectors, crc 0x{fitted.model.crc:08X}", *_report_lines(report))
+    console.result(
+        {"file": output, "n_vectors": fitted.model.vectors, "crc": fitted.model.crc, "report": report},
+        f"{output}: {fitted.model.vectors} vectors, crc 0x{fitted.model.crc:08X}",
+        *_report_lines(report),
+    )
 
 
 def _report_lines(report):
@@ -166,10 +258,21 @@ def _report_lines(report):
 
 @click.command()
 @port_argument
-@click.option("--targets", "n_targets", type=click.IntRange(1, 1000), default=25, show_default=True,
-              help="Held-out targets within +-20 deg, about one second each.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True,
-              help="The seed that was calibrated with: held-out targets keep away from its targets.")
+@click.option(
+    "--targets",
+    "n_targets",
+    type=click.IntRange(1, 1000),
+    default=25,
+    show_default=True,
+    help="Held-out targets within +-20 deg, about one second each.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="The seed that was calibrated with: held-out targets keep away from its targets.",
+)
 @click.option("--csv", type=click.Path(dir_okay=False), help="Keep the whole stream in this file.")
 @click.option("--png", type=click.Path(dir_okay=False), help="Draw gaze, targets and errors into this file.")
 @screen_options
@@ -177,28 +280,44 @@ def _report_lines(report):
 def validate(port, n_targets, seed, csv, png, distance_mm, width_mm, windowed, as_json):
     """Measure the device's gaze on targets that it was not calibrated with.
 
-    Error: angle between gaze and target, per frame, from 0.5 s after each target's onset; frames without a valid gaze
-    (blinks) are data loss. Every gaze is also computed again on the host and must be the same to the bit; if not, the
-    exit code is 1.
+    Error: angle between gaze and target, per frame, from 0.5 s after each target's onset; frames without a
+    valid gaze (blinks) are data loss. Every gaze is also computed again on the host and must be the same to
+    the bit; if not, the exit code is 1.
 
     \b
     Example:
         sparsegaze validate /dev/ttyUSB0 --targets 40 --png validation.png
     """
     from . import validate as module
+
     console = Console(as_json)
     with console.progress() as progress:
-        done = module.run(port, n_targets, seed, window=_window(distance_mm, width_mm, windowed), csv=csv,
-                          progress=progress)
+        done = module.run(
+            port, n_targets, seed, window=_window(distance_mm, width_mm, windowed), csv=csv, progress=progress
+        )
     report, rows = done.report(), done.per_target()
     if png:
         module.picture(done, png)
     for note in report["notes"]:
         console.warn(note)
-    head = ["target_az_deg", "target_el_deg", "gaze_az_deg", "gaze_el_deg", "mean_deg", "rms_s2s_deg", "data_loss_percent"]
-    console.result({**report, "per_target": rows, "csv": csv, "png": png},
-                   *table(["target az", "el", "gaze az", "el", "error deg", "rms-s2s", "loss %"],
-                          [[row[name] for name in head] for row in rows]), "", *_accuracy_lines(report))
+    head = [
+        "target_az_deg",
+        "target_el_deg",
+        "gaze_az_deg",
+        "gaze_el_deg",
+        "mean_deg",
+        "rms_s2s_deg",
+        "data_loss_percent",
+    ]
+    console.result(
+        {**report, "per_target": rows, "csv": csv, "png": png},
+        *table(
+            ["target az", "el", "gaze az", "el", "error deg", "rms-s2s", "loss %"],
+            [[row[name] for name in head] for row in rows],
+        ),
+        "",
+        *_accuracy_lines(report),
+    )
     return 0 if done.bit_identical else 1
 
 
@@ -218,98 +337,34 @@ def recentre(port, clear, distance_mm, width_mm, windowed, as_json):
     """
     from . import recentre as module
     from .device import Device
+
     console = Console(as_json)
     with Device(port) as device:
         if clear:
             before = device.recentre()
             after = device.recentre(clear=True)
-            data = {"before_deg": [before.azimuth_deg, before.elevation_deg],
-                    "after_deg": [after.azimuth_deg, after.elevation_deg]}
+            data = {
+                "before_deg": [before.azimuth_deg, before.elevation_deg],
+                "after_deg": [after.azimuth_deg, after.elevation_deg],
+            }
             console.result(data, "offset was %+.2f %+.2f deg, is 0 now" % tuple(data["before_deg"]))
             return
-        with _screen(device, _window(distance_mm, width_mm, windowed)) as shown, console.progress() as progress:
+        with (
+            _screen(device, _window(distance_mm, width_mm, windowed)) as shown,
+            console.progress() as progress,
+        ):
             report = module.run(device, shown, progress=progress)
-    console.result(report._asdict(), "gaze was %+.2f %+.2f deg at the centre" % report.gaze_deg,
-                   "offset %+.2f %+.2f deg" % report.before_deg + ", now %+.2f %+.2f deg" % report.after_deg)
+    console.result(
+        report._asdict(),
+        "gaze was %+.2f %+.2f deg at the centre" % report.gaze_deg,
+        "offset %+.2f %+.2f deg" % report.before_deg + ", now %+.2f %+.2f deg" % report.after_deg,
+    )
 
 
-@click.command()
-@port_argument
-@click.option("--seconds", type=click.FloatRange(min=0.0, min_open=True), help="Stop after this long, device time.  "
-              "[default: until Ctrl-C]")
-@click.option("--csv", type=click.Path(dir_okay=False, allow_dash=True), help="Write every frame to this file ('-': stdout).")
-@json_option
-def stream(port, seconds, csv, as_json):
-    """The gaze computed on the device at PORT, live.
-
-    A terminal shows one line: gaze in degrees (azimuth + right, elevation + up), rate in device time, lost frames.
-    CSV columns: t_us, host_time_s, seq, azimuth_deg, elevation_deg, flags, s0..s5, recentre_az_deg, recentre_el_deg.
-    A gaze whose flags lack bit 0 (valid) is no gaze: a blink, or a headset that moved.
-
-    \b
-    Example:
-        sparsegaze stream /dev/ttyUSB0 --seconds 20 --csv gaze.csv
-    """
-    from . import live
-    from .device import Device
-    if csv == "-" and as_json:
-        raise click.UsageError("--csv - and --json both want stdout")
-    console = Console(as_json)
-    line = console.live()
-    tally = live.Tally()
-    stopped = None
-    with Device(port) as device:
-        try:
-            live.run(device, tally, seconds, sys.stdout if csv == "-" else csv,
-                     lambda: line(tally.text()) if line.due else None)
-        except KeyboardInterrupt as error:
-            stopped = error
-        finally:
-            line.end()
-    data = {**tally.report(), "csv": csv, "interrupted": stopped is not None}
-    text = f"{data['frames']} frames in {data['seconds']:.1f} s ({data['rate_hz']:.1f} Hz), {data['lost']} lost, " \
-           f"{data['valid_percent']:.1f} % valid"
-    if csv == "-":
-        console.note(text)
-    else:
-        console.result(data, text)
-    if stopped is not None:
-        return 143 if type(stopped).__name__ == "Terminated" else 130
-    return 0
-
-
-@click.command()
-@click.argument("file", type=click.Path(dir_okay=False))
-@click.option("--model", "model_path", type=click.Path(dir_okay=False), required=True, help="Model file (.sgm).")
-@click.option("-o", "--output", type=click.Path(dir_okay=False), help="Write the gaze of every frame to this CSV file.")
-@json_option
-def replay(file, model_path, output, as_json):
-    """Compute the gaze of every frame in FILE again, with the very code that runs on the device.
-
-    FILE is a recording or the CSV of `stream`. Of the latter the device's own gaze is compared, and the exit code is 1
-    unless every frame is the same to the bit. Gaze is in degrees, exact multiples of 1/128; null where not valid.
-
-    \b
-    Example:
-        sparsegaze stream PORT --seconds 20 --csv gaze.csv
-        sparsegaze replay gaze.csv --model eye.sgm
-    """
-    from . import replay as module
-    from .model import DeviceModel
-    console = Console(as_json)
-    model = DeviceModel.load(model_path)
-    done = module.run(file, model)
-    if output:
-        module.write(done, output)
-    data = {"frames": len(done.t_us), "valid": int(done.valid.sum()), "compared": done.compared,
-            "differing": done.differing, "identical": done.identical, "model_crc": model.crc, "output": output}
-    if as_json and not output:
-        data.update(t_us=done.t_us, azimuth_deg=done.gaze_deg[:, 0], elevation_deg=done.gaze_deg[:, 1], flags=done.flags)
-    said = {None: "no device gaze in the file to compare with", True: f"all {done.compared} identical to the device's",
-            False: f"{done.differing} of {done.compared} DIFFER from the device's"}[done.identical]
-    console.result(data, f"{data['frames']} frames, {data['valid']} with a valid gaze; {said}")
-    return 1 if done.identical is False else 0
-
-
-COMMANDS = {"calibrate": calibrate, "record": record, "fit": fit, "validate": validate, "recentre": recentre,
-            "stream": stream, "replay": replay}
+COMMANDS = {
+    "calibrate": calibrate,
+    "record": record,
+    "fit": fit,
+    "validate": validate,
+    "recentre": recentre,
+}

@@ -3,14 +3,19 @@
 
 With --json stdout carries exactly one JSON object, whatever happens. Only the command line uses this module.
 """
+
 import contextlib
 import json
 import sys
 import time
 
 STAGES = {
-    "write": "writing", "verify": "reading back", "targets": "targets", "fit": "fitting the model",
-    "exposures": "waiting for the exposures to settle", "recentre": "look at the dot",
+    "write": "writing",
+    "verify": "reading back",
+    "targets": "targets",
+    "fit": "fitting the model",
+    "exposures": "waiting for the exposures to settle",
+    "recentre": "look at the dot",
     "press reset": "press the board's reset button now",
 }
 
@@ -25,6 +30,7 @@ class Console:
         """The command's one result: `data` (a dict) as JSON, or else the given lines of text."""
         if self.as_json:
             from .calibrate import plain
+
             sys.stdout.write(json.dumps(plain(data), allow_nan=False) + "\n")
         else:
             for line in lines:
@@ -42,7 +48,9 @@ class Console:
 
     @contextlib.contextmanager
     def progress(self):
-        """Yields a callback (stage, done, total): a bar on a terminal, a line per quarter elsewhere, all on stderr."""
+        """Yields a callback (stage, done, total): a bar on a terminal, a line per quarter elsewhere, all on
+        stderr.
+        """
         if sys.stderr.isatty():
             with self._bar() as step:
                 yield step
@@ -53,15 +61,24 @@ class Console:
     def _bar(self):
         from rich.console import Console as RichConsole
         from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
         tasks = {}
-        with Progress(TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(),
-                      console=RichConsole(stderr=True)) as bars:
+        with Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+            console=RichConsole(stderr=True),
+        ) as bars:
+
             def step(stage, done, total):
                 if stage not in tasks:
                     for other in tasks.values():
+                        bars.update(other, total=1, completed=1)
                         bars.stop_task(other)
                     tasks[stage] = bars.add_task(STAGES.get(stage, stage), total=None)
                 bars.update(tasks[stage], completed=done, total=total or None)
+
             yield step
 
     def live(self):
@@ -113,11 +130,15 @@ class _Live:
 def table(head, rows):
     """Lines of a plain aligned table: head (names), rows (sequences); numbers to the right."""
     cells = [[str(name) for name in head]] + [[_cell(value) for value in row] for row in rows]
-    right = [all(isinstance(row[i], (int, float)) or row[i] is None for row in rows) and bool(rows)
-             for i in range(len(head))]
+    right = [
+        all(isinstance(row[i], (int, float)) or row[i] is None for row in rows) and bool(rows)
+        for i in range(len(head))
+    ]
     width = [max(len(row[i]) for row in cells) for i in range(len(head))]
-    return ["  ".join(cell.rjust(w) if r else cell.ljust(w) for cell, w, r in zip(row, width, right)).rstrip()
-            for row in cells]
+    return [
+        "  ".join(cell.rjust(w) if r else cell.ljust(w) for cell, w, r in zip(row, width, right)).rstrip()
+        for row in cells
+    ]
 
 
 def pairs(items):

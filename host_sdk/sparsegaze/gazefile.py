@@ -1,23 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
 """The CSV of a gaze stream: gaze and the features it came from, one line per frame, exact.
 
-Columns: t_us (device time, mean sample time), host_time_s (when it arrived), seq, azimuth_deg, elevation_deg (exact
-multiples of 1/128 deg; nan where no gaze came), flags (bits of enum sg_flag), s0..s5 (features), recentre_az_deg,
-recentre_el_deg (offset included in the gaze). `replay` computes the gaze of such a file again and compares the bits.
+Columns: t_us (device time, mean sample time), host_time_s (when it arrived), seq, azimuth_deg, elevation_deg
+(exact multiples of 1/128 deg; nan where no gaze came), flags (bits of enum sg_flag), s0..s5 (features),
+recentre_az_deg, recentre_el_deg (offset included in the gaze). `replay` computes the gaze of such a file
+again and compares the bits.
 """
+
 import os
 
 from .errors import RecordingError
 from .replay import DEG_Q7
 
-COLUMNS = ("t_us", "host_time_s", "seq", "azimuth_deg", "elevation_deg", "flags", "s0", "s1", "s2", "s3", "s4", "s5",
-           "recentre_az_deg", "recentre_el_deg")
+COLUMNS = (
+    "t_us",
+    "host_time_s",
+    "seq",
+    "azimuth_deg",
+    "elevation_deg",
+    "flags",
+    "s0",
+    "s1",
+    "s2",
+    "s3",
+    "s4",
+    "s5",
+    "recentre_az_deg",
+    "recentre_el_deg",
+)
 
 
 class GazeCsv:
     """Writes a stream's CSV while it arrives, in whole lines. A context manager.
 
-    path  file name, or an open text file (then not closed here).  Raises RecordingError; BrokenPipeError of a pipe.
+    path  file name, or an open text file (then not closed here).  Raises RecordingError; BrokenPipeError of a
+          pipe.
     """
 
     def __init__(self, path, meta=None, flush_rows=64):
@@ -34,18 +51,32 @@ class GazeCsv:
         self.flush()
 
     def add(self, frame):
-        """Append a device.Frame; one without raw data has nan features and is not replayed, so it is left out."""
+        """Append a device.Frame; one without raw data has nan features and is not replayed, so it is left
+        out.
+        """
         raw, gaze = frame.raw, frame.gaze
         if raw is None:
             return
         if raw.model_crc != self._crc:
             self._crc = raw.model_crc
             self._lines.append(f"# model_crc: 0x{self._crc:08X}\n")
-        angles = ("%.7f,%.7f,%d" % (gaze.azimuth_deg_q7 / DEG_Q7, gaze.elevation_deg_q7 / DEG_Q7, gaze.flags)
-                  if gaze is not None else f"nan,nan,{raw.flags}")
-        self._lines.append("%d,%.6f,%d,%s,%s,%.7f,%.7f\n" % (
-            frame.t_us, frame.host_time, frame.seq, angles, ",".join("%d" % v for v in raw.feature),
-            raw.recentre_az_deg_q7 / DEG_Q7, raw.recentre_el_deg_q7 / DEG_Q7))
+        angles = (
+            "%.7f,%.7f,%d" % (gaze.azimuth_deg_q7 / DEG_Q7, gaze.elevation_deg_q7 / DEG_Q7, gaze.flags)
+            if gaze is not None
+            else f"nan,nan,{raw.flags}"
+        )
+        self._lines.append(
+            "%d,%.6f,%d,%s,%s,%.7f,%.7f\n"
+            % (
+                frame.t_us,
+                frame.host_time,
+                frame.seq,
+                angles,
+                ",".join("%d" % v for v in raw.feature),
+                raw.recentre_az_deg_q7 / DEG_Q7,
+                raw.recentre_el_deg_q7 / DEG_Q7,
+            )
+        )
         self.rows += 1
         if len(self._lines) >= self._flush_rows:
             self.flush()
@@ -77,4 +108,6 @@ class GazeCsv:
         self.close()
 
     def _unwritable(self, error):
-        return RecordingError(f"cannot write {self.path}: {error.strerror}", "choose another place with --csv")
+        return RecordingError(
+            f"cannot write {self.path}: {error.strerror}", "choose another place with --csv"
+        )

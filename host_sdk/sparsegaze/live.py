@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A gaze stream as it arrives: counted, shown, kept."""
+
 from .gazefile import GazeCsv
 
 
@@ -9,7 +10,7 @@ class Tally:
     def __init__(self):
         self.frames = self.valid = self.lost = self.incomplete = self.bad = 0
         self.first_us = self.last_us = None
-        self.gaze = None            # the latest, valid or not
+        self.gaze = None  # the latest, valid or not
         self.clock_drift = 0.0
 
     def add(self, frame, device):
@@ -44,23 +45,35 @@ class Tally:
 
     def report(self):
         """Plain numbers."""
-        return {"seconds": self.seconds, "frames": self.frames, "rate_hz": self.rate_hz, "lost": self.lost,
-                "incomplete": self.incomplete, "bad_crc": self.bad, "valid": self.valid,
-                "valid_percent": 100.0 * self.valid / self.frames if self.frames else 0.0,
-                "clock_drift_ppm": self.clock_drift * 1e6}
+        return {
+            "seconds": self.seconds,
+            "frames": self.frames,
+            "rate_hz": self.rate_hz,
+            "lost": self.lost,
+            "incomplete": self.incomplete,
+            "bad_crc": self.bad,
+            "valid": self.valid,
+            "valid_percent": 100.0 * self.valid / self.frames if self.frames else 0.0,
+            "clock_drift_ppm": self.clock_drift * 1e6,
+        }
 
 
 def run(device, tally, seconds=None, csv=None, shown=None):
     """Stream from an open device until `seconds` of device time have passed (None: until interrupted).
 
-    tally  Tally to keep up to date; csv: path or open text file for every frame; shown: called after every frame
+    tally  Tally to keep up to date; csv: path or open text file for every frame; shown: called after every
+           frame
     The CSV is complete whatever ends the stream. Raises NoDeviceError, DisconnectedError, RecordingError.
     """
     writer = None if csv is None else GazeCsv(csv)
     try:
         device.set_stream(raw=writer is not None, gaze=True)
         for frame in device.frames():
-            if seconds is not None and tally.first_us is not None and frame.t_us - tally.first_us >= seconds * 1e6:
+            if (
+                seconds is not None
+                and tally.first_us is not None
+                and frame.t_us - tally.first_us >= seconds * 1e6
+            ):
                 break
             tally.add(frame, device)
             if writer is not None:

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One look at a known point puts right what a shifted headset put wrong: an offset, without a new calibration."""
+"""One look at a known point puts right what a shifted headset put wrong: an offset, without a new
+calibration.
+"""
+
 from typing import NamedTuple
 
 import numpy as np
 
 from .errors import CalibrationError
 
-SETTLE_S = 0.6              # for the eye to get there
+SETTLE_S = 0.6  # for the eye to get there
 COLLECT_S = 0.7
-LIMIT_S = 6.0               # in all, for eyes that blink
+LIMIT_S = 6.0  # in all, for eyes that blink
 LEAST_FRAMES = 60
-SPREAD_LIMIT_DEG = 2.0      # a gaze that wanders more was not resting on the point
+SPREAD_LIMIT_DEG = 2.0  # a gaze that wanders more was not resting on the point
 OFFSET_LIMIT_DEG = 30.0
 
 
@@ -20,21 +23,25 @@ class RecentreReport(NamedTuple):
     before_deg: tuple
     after_deg: tuple
     gaze_deg: tuple
-    error_deg: float        # of that gaze to the target, before
+    error_deg: float  # of that gaze to the target, before
     frames: int
 
 
 def run(device, screen, target_deg=(0.0, 0.0), progress=None):
     """Show one target, take the median of the valid gaze on it, set the offset so that it lies on the target.
 
-    device  open Device with a model; screen see screen.py. The new offset is kept by the device over power cycles.
-    Returns RecentreReport. Raises CalibrationError when there is no steady valid gaze; the old offset then stays.
+    device  open Device with a model; screen see screen.py. The new offset is kept by the device over power
+            cycles.
+    Returns RecentreReport. Raises CalibrationError when there is no steady valid gaze; the old offset then
+    stays.
     """
     screen.open(device)
     before = device.recentre()
     if device.model_info().active > 2:
-        raise CalibrationError("the device has no model, so there is no gaze to recentre",
-                               "calibrate first: `sparsegaze calibrate PORT`")
+        raise CalibrationError(
+            "the device has no model, so there is no gaze to recentre",
+            "calibrate first: `sparsegaze calibrate PORT`",
+        )
     device.set_stream(gaze=True)
     kept, begin, seen = [], None, 0
     for frame in device.frames():
@@ -56,19 +63,30 @@ def run(device, screen, target_deg=(0.0, 0.0), progress=None):
             break
     device.set_stream()
     if len(kept) < LEAST_FRAMES:
-        raise CalibrationError(f"only {len(kept)} of {seen} frames had a valid gaze; the offset stays as it was",
-                               "look at the dot with open eyes; if it goes on, put the headset on anew or calibrate again")
+        raise CalibrationError(
+            f"only {len(kept)} of {seen} frames had a valid gaze; the offset stays as it was",
+            "look at the dot with open eyes; if it goes on, put the headset on anew or calibrate again",
+        )
     gaze = np.array(kept)
     middle = np.median(gaze, axis=0)
     spread = 1.4826 * np.median(np.hypot(*(gaze - middle).T))
     if spread > SPREAD_LIMIT_DEG:
-        raise CalibrationError(f"the gaze wandered by {spread:.1f} deg; the offset stays as it was",
-                               "look at the dot until it is done")
+        raise CalibrationError(
+            f"the gaze wandered by {spread:.1f} deg; the offset stays as it was",
+            "look at the dot until it is done",
+        )
     correction = np.asarray(target_deg, float) - middle
     offset = np.array([before.azimuth_deg, before.elevation_deg]) + correction
     if np.abs(offset).max() > OFFSET_LIMIT_DEG:
-        raise CalibrationError(f"an offset of {np.abs(offset).max():.0f} deg is no headset shift; the old one stays",
-                               "calibrate again: `sparsegaze calibrate PORT`")
+        raise CalibrationError(
+            f"an offset of {np.abs(offset).max():.0f} deg is no headset shift; the old one stays",
+            "calibrate again: `sparsegaze calibrate PORT`",
+        )
     after = device.recentre(offset_deg=(float(offset[0]), float(offset[1])))
-    return RecentreReport((before.azimuth_deg, before.elevation_deg), (after.azimuth_deg, after.elevation_deg),
-                          (float(middle[0]), float(middle[1])), float(np.hypot(*correction)), len(kept))
+    return RecentreReport(
+        (before.azimuth_deg, before.elevation_deg),
+        (after.azimuth_deg, after.elevation_deg),
+        (float(middle[0]), float(middle[1])),
+        float(np.hypot(*correction)),
+        len(kept),
+    )

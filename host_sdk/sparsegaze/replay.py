@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The firmware's core on the host, over recorded frames: the same bits as the device.
 
-One C function, sg_track_infer, is what the device calls for every frame; here it runs through sparsegaze._core.
+One C function, sg_track_infer, is what the device calls for every frame; here it runs through
+sparsegaze._core.
 """
+
 import csv
 import os
 
@@ -24,11 +26,12 @@ def infer(model, features, raw_flags=None, recentre_q7=None):
     Returns (gaze_q7 int16 [n, 2] azimuth and elevation in 1/128 deg, flags uint8 [n]). Raises ModelError.
     """
     from . import _core
+
     ffi, lib = _core.ffi, _core.lib
     features = np.asarray(features)
     n = len(features)
     six = np.zeros((n, CHANNELS), np.uint16)
-    six[:, :features.shape[1]] = features
+    six[:, : features.shape[1]] = features
     flags = np.zeros(n, np.uint8) if raw_flags is None else np.ascontiguousarray(raw_flags, np.uint8)
     offsets = np.zeros(2, np.int16) if recentre_q7 is None else np.asarray(recentre_q7, np.int16)
     offsets = np.ascontiguousarray(np.broadcast_to(offsets, (n, 2)))
@@ -42,22 +45,33 @@ def infer(model, features, raw_flags=None, recentre_q7=None):
     size = ffi.sizeof("struct sg_gaze")
     out = ffi.new("struct sg_gaze[]", max(n, 1))
     # The core takes one offset per batch: cut where it changes.
-    edges = np.flatnonzero(np.any(np.diff(offsets.astype(np.int32), axis=0) != 0, axis=1)) + 1 if n > 1 else []
+    edges = (
+        np.flatnonzero(np.any(np.diff(offsets.astype(np.int32), axis=0) != 0, axis=1)) + 1 if n > 1 else []
+    )
     for begin, end in zip([0, *edges], [*edges, n]):
         if end > begin:
             # A saturated gaze is reported as SG_E_RANGE and holds what the device sends too.
             lib.sg_batch_infer(
-                view, ffi.from_buffer("uint16_t[]", six[begin:end]), ffi.from_buffer("uint8_t[]", flags[begin:end]),
-                ffi.new("int16_t[2]", [int(v) for v in offsets[begin]]), out + int(begin), int(end - begin))
-    layout = np.dtype([("t_us", "<u4"), ("q7", "<i2", (2,)), ("infer_us", "<u2"), ("flags", "u1"), ("reserved", "u1")])
+                view,
+                ffi.from_buffer("uint16_t[]", six[begin:end]),
+                ffi.from_buffer("uint8_t[]", flags[begin:end]),
+                ffi.new("int16_t[2]", [int(v) for v in offsets[begin]]),
+                out + int(begin),
+                int(end - begin),
+            )
+    layout = np.dtype(
+        [("t_us", "<u4"), ("q7", "<i2", (2,)), ("infer_us", "<u2"), ("flags", "u1"), ("reserved", "u1")]
+    )
     assert layout.itemsize == size
     frames = np.frombuffer(ffi.buffer(out, n * size), layout) if n else np.zeros(0, layout)
     return frames["q7"].copy(), frames["flags"].copy()
 
 
 class Replay:
-    """Outcome of `run`: arrays t_us [n], gaze_deg float64 [n, 2] (NaN where not valid), gaze_q7, flags, valid [n];
-    compared, differing: device gaze frames held against, and how many were not the same bits; identical None|bool."""
+    """Outcome of `run`: arrays t_us [n], gaze_deg float64 [n, 2] (NaN where not valid), gaze_q7, flags, valid
+    [n]; compared, differing: device gaze frames held against, and how many were not the same bits; identical
+    None|bool.
+    """
 
     def __init__(self, t_us, gaze_q7, flags, valid_bit, compared, differing):
         self.t_us, self.gaze_q7, self.flags = t_us, gaze_q7, flags
@@ -70,19 +84,23 @@ class Replay:
 def run(path, model):
     """Compute every frame of a recording or of a stream's CSV again, and compare with the gaze in it, if any.
 
-    path   CSV with columns t_us and s0..; of a stream's CSV also azimuth_deg, elevation_deg, flags and recentre_*_deg
+    path   CSV with columns t_us and s0..; of a stream's CSV also azimuth_deg, elevation_deg, flags and
+           recentre_*_deg
     model  DeviceModel
     Returns Replay. Raises RecordingError (naming line and column), ModelError.
     """
     from . import _core
+
     lib = _core.lib
     columns, lines = read_columns(path)
     features = feature_columns(path, columns, lines)
     n, d = features.shape
     if d < model.channels:
-        raise ModelError(f"the model has {model.channels} channels, {path} has {d}",
-                         "use the model that was fitted to recordings of this headset")
-    t_us = integers(path, columns, lines, "t_us", 0, 2 ** 63 - 1) if "t_us" in columns else np.arange(n)
+        raise ModelError(
+            f"the model has {model.channels} channels, {path} has {d}",
+            "use the model that was fitted to recordings of this headset",
+        )
+    t_us = integers(path, columns, lines, "t_us", 0, 2**63 - 1) if "t_us" in columns else np.arange(n)
     carried = lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_EXPOSURE | lib.SG_FLAG_TRIAL
     device = all(name in columns for name in ("azimuth_deg", "elevation_deg", "flags"))
     flags = integers(path, columns, lines, "flags", 0, 255) if device else np.zeros(n, np.int64)
@@ -93,7 +111,9 @@ def run(path, model):
     gaze_q7, out = infer(model, features, flags & carried, recentre)
     compared = differing = 0
     if device:
-        said = np.column_stack([numbers(path, columns, lines, name) for name in ("azimuth_deg", "elevation_deg")])
+        said = np.column_stack(
+            [numbers(path, columns, lines, name) for name in ("azimuth_deg", "elevation_deg")]
+        )
         have = np.isfinite(said).all(axis=1)
         same = (np.round(np.where(have[:, None], said, 0.0) * DEG_Q7) == gaze_q7).all(axis=1) & (flags == out)
         compared, differing = int(have.sum()), int(np.sum(have & ~same))
@@ -101,7 +121,9 @@ def run(path, model):
 
 
 def write(done, path):
-    """Write a Replay as CSV: t_us, azimuth_deg, elevation_deg (nan where not valid), flags. Raises RecordingError."""
+    """Write a Replay as CSV: t_us, azimuth_deg, elevation_deg (nan where not valid), flags. Raises
+    RecordingError.
+    """
     part = f"{path}.part"
     try:
         with open(part, "w", encoding="utf-8", newline="\n") as file:
@@ -110,7 +132,9 @@ def write(done, path):
                 file.write(f"{t_us},{azimuth:.7f},{elevation:.7f},{flags}\n")
         os.replace(part, path)
     except OSError as error:
-        raise RecordingError(f"cannot write {path}: {error.strerror}", "choose another place with -o") from None
+        raise RecordingError(
+            f"cannot write {path}: {error.strerror}", "choose another place with -o"
+        ) from None
 
 
 def read_columns(path):
@@ -125,14 +149,18 @@ def read_columns(path):
                 if header is None:
                     header = cells
                 elif len(cells) != len(header):
-                    raise RecordingError(f"{path}, line {number}: {len(cells)} cells under {len(header)} columns",
-                                         "the file was cut or edited: record again, or remove that line")
+                    raise RecordingError(
+                        f"{path}, line {number}: {len(cells)} cells under {len(header)} columns",
+                        "the file was cut or edited: record again, or remove that line",
+                    )
                 else:
                     rows.append(cells)
                     lines.append(number)
     except OSError as error:
-        raise RecordingError(f"cannot read {path}: {error.strerror}",
-                             "name a file made by sparsegaze record or sparsegaze stream --csv") from None
+        raise RecordingError(
+            f"cannot read {path}: {error.strerror}",
+            "name a file made by sparsegaze record or sparsegaze stream --csv",
+        ) from None
     except csv.Error as error:
         raise RecordingError(f"{path} is not a CSV file ({error})", "name a recording") from None
     if header is None:
@@ -149,8 +177,9 @@ def numbers(path, columns, lines, name):
             try:
                 float(text)
             except ValueError:
-                raise RecordingError(f"{path}, line {line}, column {name}: {text!r} is no number",
-                                     "repair or remove that line") from None
+                raise RecordingError(
+                    f"{path}, line {line}, column {name}: {text!r} is no number", "repair or remove that line"
+                ) from None
         raise
 
 
@@ -160,10 +189,17 @@ def integers(path, columns, lines, name, low, high):
         values = np.array([int(text) for text in columns[name]], np.int64).reshape(-1)
         bad = np.flatnonzero((values < low) | (values > high))
     except (ValueError, OverflowError):
-        bad = [next(i for i, text in enumerate(columns[name]) if not text.lstrip("-").isdigit() or len(text) > 18)]
+        bad = [
+            next(
+                i for i, text in enumerate(columns[name]) if not text.lstrip("-").isdigit() or len(text) > 18
+            )
+        ]
     if len(bad):
-        raise RecordingError(f"{path}, line {lines[bad[0]]}, column {name}: {columns[name][bad[0]]!r} is not a whole "
-                             f"number from {low} to {high}", "repair or remove that line")
+        raise RecordingError(
+            f"{path}, line {lines[bad[0]]}, column {name}: {columns[name][bad[0]]!r} is not a whole "
+            f"number from {low} to {high}",
+            "repair or remove that line",
+        )
     return values
 
 
@@ -173,8 +209,12 @@ def feature_columns(path, columns, lines):
     while f"s{d}" in columns:
         d += 1
     if not 1 <= d <= CHANNELS:
-        raise RecordingError(f"{path} has {d or 'no'} feature columns s0..s{CHANNELS - 1}",
-                             "name a file made by sparsegaze record or sparsegaze stream --csv")
+        raise RecordingError(
+            f"{path} has {d or 'no'} feature columns s0..s{CHANNELS - 1}",
+            "name a file made by sparsegaze record or sparsegaze stream --csv",
+        )
     if not lines:
         raise RecordingError(f"{path} has a header but no frames", "record again")
-    return np.column_stack([integers(path, columns, lines, f"s{i}", 0, 65535) for i in range(d)]).astype(np.uint16)
+    return np.column_stack([integers(path, columns, lines, f"s{i}", 0, 65535) for i in range(d)]).astype(
+        np.uint16
+    )

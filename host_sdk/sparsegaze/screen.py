@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where targets are shown: to a simulated person (exact, in device time) or full screen to a real one.
 
-A screen is started with targets and their onsets in device time, told the time once per frame by `tick`, and asked
-afterwards when each target really appeared (`onsets_us`). It never decides what is shown when; the plan does.
+A screen is started with targets and their onsets in device time, told the time once per frame by `tick`, and
+asked afterwards when each target really appeared (`onsets_us`). It never decides what is shown when; the plan
+does.
 """
+
 import math
 
 from .errors import CalibrationError
 
 
 def to_millimetres(target_deg, distance_mm):
-    """Fick (azimuth, elevation) in degrees -> (right, up) in mm on a flat screen at distance_mm, seen from its centre."""
+    """Fick (azimuth, elevation) in degrees -> (right, up) in mm on a flat screen at distance_mm, seen from
+    its centre.
+    """
     azimuth, elevation = (math.radians(v) for v in target_deg)
     return distance_mm * math.tan(azimuth), distance_mm * math.tan(elevation) / math.cos(azimuth)
 
@@ -18,14 +22,16 @@ def to_millimetres(target_deg, distance_mm):
 class Display:
     """Geometry of a flat display in front of one eye.
 
-    pixels (width, height); width_mm of the lit area (or of its virtual image behind a lens); distance_mm from the eye.
-    Pixels are taken as square.
+    pixels (width, height); width_mm of the lit area (or of its virtual image behind a lens); distance_mm from
+    the eye. Pixels are taken as square.
     """
 
     def __init__(self, pixels, width_mm, distance_mm):
         if not (width_mm > 0 and distance_mm > 0):
-            raise CalibrationError("the screen's width and distance must be positive lengths in mm",
-                                   "measure them and pass --width-mm and --distance-mm")
+            raise CalibrationError(
+                "the screen's width and distance must be positive lengths in mm",
+                "measure them and pass --width-mm and --distance-mm",
+            )
         self.pixels = tuple(pixels)
         self.mm_per_pixel = width_mm / pixels[0]
         self.distance_mm = float(distance_mm)
@@ -44,12 +50,15 @@ class Display:
         half_w = self.pixels[0] / 2 * self.mm_per_pixel
         half_h = self.pixels[1] / 2 * self.mm_per_pixel
         azimuth = math.degrees(math.atan(half_w / self.distance_mm)) - margin_deg
-        elevation = math.degrees(math.atan(half_h * math.cos(math.radians(max(azimuth, 0.0))) / self.distance_mm))
+        elevation = math.degrees(
+            math.atan(half_h * math.cos(math.radians(max(azimuth, 0.0))) / self.distance_mm)
+        )
         return max(azimuth, 0.0), max(elevation - margin_deg, 0.0)
 
 
 class VirtualScreen:
-    """Targets scheduled on a virtual Nano: the simulated person follows them, exact to the device microsecond.
+    """Targets scheduled on a virtual Nano: the simulated person follows them, exact to the device
+    microsecond.
 
     control  VirtualControl of the running virtual Nano
     """
@@ -58,11 +67,13 @@ class VirtualScreen:
 
     def __init__(self, control):
         self.control = control
-        self.offset_us = None       # device time minus the virtual Nano's own time, us
+        self.offset_us = None  # device time minus the virtual Nano's own time, us
         self._onsets = []
 
     def open(self, device):
-        """Learn how device time and the virtual Nano's time relate, by pings between two looks at its clock."""
+        """Learn how device time and the virtual Nano's time relate, by pings between two looks at its
+        clock.
+        """
         low, high = None, None
         for _ in range(5):
             before = self.control.time().us
@@ -102,8 +113,9 @@ class VirtualScreen:
 class WindowScreen:
     """Full-screen targets for a real person, through SDL (pygame-ce, the `screen` extra).
 
-    A dot with a ring that shrinks onto it during the first 0.4 s draws the eye. Esc or closing the window raises
-    KeyboardInterrupt. distance_mm, width_mm: see Display; full_screen False opens a window of `size` pixels.
+    A dot with a ring that shrinks onto it during the first 0.4 s draws the eye. Esc or closing the window
+    raises KeyboardInterrupt. distance_mm, width_mm: see Display; full_screen False opens a window of `size`
+    pixels.
     """
 
     name = "screen"
@@ -115,8 +127,10 @@ class WindowScreen:
         try:
             import pygame
         except ImportError:
-            raise CalibrationError("showing targets on a real screen needs pygame-ce",
-                                   'install it: pip install "sparsegaze[screen]"') from None
+            raise CalibrationError(
+                "showing targets on a real screen needs pygame-ce",
+                'install it: pip install "sparsegaze[screen]"',
+            ) from None
         self._pygame = pygame
         try:
             pygame.display.init()
@@ -126,8 +140,10 @@ class WindowScreen:
             pygame.mouse.set_visible(False)
         except pygame.error as error:
             pygame.display.quit()
-            raise CalibrationError(f"no screen to show targets on ({error})",
-                                   "run this at a graphical desktop, or calibrate a virtual Nano") from None
+            raise CalibrationError(
+                f"no screen to show targets on ({error})",
+                "run this at a graphical desktop, or calibrate a virtual Nano",
+            ) from None
         try:
             self.display = Display(self._surface.get_size(), width_mm, distance_mm)
         except CalibrationError:
@@ -165,12 +181,15 @@ class WindowScreen:
         events = self._pygame.event.get()
         for event in events:
             if event.type == self._pygame.QUIT or (
-                    event.type == self._pygame.KEYDOWN and event.key == self._pygame.K_ESCAPE):
+                event.type == self._pygame.KEYDOWN and event.key == self._pygame.K_ESCAPE
+            ):
                 raise KeyboardInterrupt
         appeared = False
         while len(self._onsets) < len(self._due) and now_us >= self._due[len(self._onsets)]:
             self._shown = self._targets[len(self._onsets)]
-            self._onsets.append(now_us)     # late by one refresh at most; the label says when it was really drawn
+            self._onsets.append(
+                now_us
+            )  # late by one refresh at most; the label says when it was really drawn
             self._since_us = now_us
             appeared = True
         age_s = self.RING_S if self._since_us is None else (now_us - self._since_us) * 1e-6
@@ -201,6 +220,8 @@ class WindowScreen:
 
 
 def screen_for(device, **window):
-    """The screen that belongs to an open device: its simulated person's, or a window (arguments of WindowScreen)."""
+    """The screen that belongs to an open device: its simulated person's, or a window (arguments of
+    WindowScreen).
+    """
     control = device.link.control
     return WindowScreen(**window) if control is None else VirtualScreen(control)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which recorded frames say where the eye looks: settling, blinks and inattention are marked, never deleted.
 
-Features are unsigned 16-bit log2 photocurrents, 4096 per octave, so a change of light by a fixed *ratio* is the same
-step everywhere and one threshold serves dark and bright channels alike.
+Features are unsigned 16-bit log2 photocurrents, 4096 per octave, so a change of light by a fixed *ratio* is
+the same step everywhere and one threshold serves dark and bright channels alike.
 """
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,14 +14,14 @@ USED, SETTLING, FLAGGED, BLINK, UNSTABLE, INATTENTIVE, OUTSIDE = range(7)
 REASONS = ("used", "settling", "flagged", "blink", "unstable", "inattentive", "outside")
 
 OCTAVE = 4096.0
-LAG_FRAMES = 4              # a lid closes within 50..80 ms = 14..22 frames of 3.6 ms; noise averages over such a lag
-PAD_FRAMES = 6              # lids move slowly before and after the part that a derivative shows
-JUMP_FLOOR = 0.012 * OCTAVE     # steps smaller than this are fixational movement, whatever the noise
+LAG_FRAMES = 4  # a lid closes within 50..80 ms = 14..22 frames of 3.6 ms; noise averages over such a lag
+PAD_FRAMES = 6  # lids move slowly before and after the part that a derivative shows
+JUMP_FLOOR = 0.012 * OCTAVE  # steps smaller than this are fixational movement, whatever the noise
 LEVEL_FLOOR = 0.020 * OCTAVE
 JUMP_SIGMAS = 8.0
 LEVEL_SIGMAS = 6.0
-LEAST_SHARE = 0.25          # of a settled fixation that must survive, or none of it is trusted
-LOST_DEG = 6.0              # a fixation this far from where its signals say it is was on another place
+LEAST_SHARE = 0.25  # of a settled fixation that must survive, or none of it is trusted
+LOST_DEG = 6.0  # a fixation this far from where its signals say it is was on another place
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,9 @@ class Selection:
 
     def counts(self):
         """{reason: number of frames}, only those that occur."""
-        return {name: int(np.sum(self.reason == i)) for i, name in enumerate(REASONS) if np.any(self.reason == i)}
+        return {
+            name: int(np.sum(self.reason == i)) for i, name in enumerate(REASONS) if np.any(self.reason == i)
+        }
 
 
 def noise_of(features):
@@ -56,8 +59,9 @@ def blinks(features, noise=None):
     """Frames of one fixation that are not steady gaze: bool [n], true = blink, saccade or lid in motion.
 
     features  [n, d], consecutive frames of one settled fixation; noise: noise_of() the whole recording.
-    Two tests. Derivative: the mean of LAG_FRAMES frames against that of the next LAG_FRAMES, any channel. Level: the
-    steady rest against its own densest half, any channel, which finds shut lids between two movements.
+    Two tests. Derivative: the mean of LAG_FRAMES frames against that of the next LAG_FRAMES, any channel.
+    Level: the steady rest against its own densest half, any channel, which finds shut lids between two
+    movements.
     """
     x = np.asarray(features, float)
     n = len(x)
@@ -69,7 +73,7 @@ def blinks(features, noise=None):
     step = np.abs(mean[LAG_FRAMES:] - mean[:-LAG_FRAMES])
     limit = np.maximum(JUMP_SIGMAS * noise * np.sqrt(2.0 / LAG_FRAMES), JUMP_FLOOR)
     moving = np.zeros(n, bool)
-    moving[LAG_FRAMES:LAG_FRAMES + len(step)] = (step > limit).any(axis=1)
+    moving[LAG_FRAMES : LAG_FRAMES + len(step)] = (step > limit).any(axis=1)
     moving = _dilate(moving, PAD_FRAMES)
     steady = ~moving
     if steady.sum() < LEAST_SHARE * n:
@@ -99,9 +103,9 @@ def _shortest_half(x):
 def inattentive(centre, target_deg):
     """Fixations whose signals belong to another place: bool [k].
 
-    centre [k, d] steady features per fixation, target_deg [k, 2]. A ridge regression quadratic in the principal
-    components predicts each target from the others (closed-form leave-one-out); misses of more than LOST_DEG and
-    of 6 robust deviations are dropped one by one, worst first, each time fitting anew.
+    centre [k, d] steady features per fixation, target_deg [k, 2]. A ridge regression quadratic in the
+    principal components predicts each target from the others (closed-form leave-one-out); misses of more than
+    LOST_DEG and of 6 robust deviations are dropped one by one, worst first, each time fitting anew.
     """
     k = len(centre)
     lost = np.zeros(k, bool)
@@ -131,9 +135,9 @@ def inattentive(centre, target_deg):
 def select(t_us, features, flagged, target_index, onset_us, target_deg, settle_s):
     """Mark every frame of a run.
 
-    t_us int64 [n], features [n, d], flagged bool [n] (saturated or starved), target_index int [n] (-1 outside the
-    plan), onset_us int64 [k] when each target really appeared, target_deg [k, 2], settle_s seconds to discard.
-    Returns Selection.
+    t_us int64 [n], features [n, d], flagged bool [n] (saturated or starved), target_index int [n] (-1 outside
+    the plan), onset_us int64 [k] when each target really appeared, target_deg [k, 2], settle_s seconds to
+    discard. Returns Selection.
     """
     t_us = np.asarray(t_us, np.int64)
     features = np.asarray(features)

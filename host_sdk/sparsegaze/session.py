@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """One run of targets in front of a streaming device: who was shown what when, and what the device sent.
 
-Everything is in device time: the plan is laid out on the device's clock, frames carry it, onsets are reported in it.
-The run is driven by the frames themselves, so on an unpaced virtual Nano it is a pure function of the seed.
+Everything is in device time: the plan is laid out on the device's clock, frames carry it, onsets are reported
+in it. The run is driven by the frames themselves, so on an unpaced virtual Nano it is a pure function of the
+seed.
 """
+
 from dataclasses import dataclass, field
 from typing import Optional
 
@@ -12,14 +14,16 @@ import numpy as np
 from .errors import CalibrationError
 from .replay import DEG_Q7
 
-LEAD_S = 0.3                # between the decision to start and the first target
-CALM_S = 0.5                # this long without a change of exposure counts as settled
+LEAD_S = 0.3  # between the decision to start and the first target
+CALM_S = 0.5  # this long without a change of exposure counts as settled
 CALM_LIMIT_S = 6.0
 FRAME_TIMEOUT_S = 2.0
 
 
 class FrameLog:
-    """Frames as they arrive; arrays on request. Frames without a raw part are counted in `torn` and left out."""
+    """Frames as they arrive; arrays on request. Frames without a raw part are counted in `torn` and left
+    out.
+    """
 
     def __init__(self):
         self._rows = []
@@ -34,25 +38,61 @@ class FrameLog:
         if raw is None:
             self.torn += 1
             return
-        self._rows.append((frame.seq, frame.t_us, frame.host_time, *raw.feature, raw.flags, raw.model_crc,
-                           raw.recentre_az_deg_q7, raw.recentre_el_deg_q7, gaze is not None,
-                           *((gaze.azimuth_deg_q7, gaze.elevation_deg_q7, gaze.flags, gaze.infer_us)
-                             if gaze is not None else (0, 0, 0, 0))))
+        self._rows.append(
+            (
+                frame.seq,
+                frame.t_us,
+                frame.host_time,
+                *raw.feature,
+                raw.flags,
+                raw.model_crc,
+                raw.recentre_az_deg_q7,
+                raw.recentre_el_deg_q7,
+                gaze is not None,
+                *(
+                    (gaze.azimuth_deg_q7, gaze.elevation_deg_q7, gaze.flags, gaze.infer_us)
+                    if gaze is not None
+                    else (0, 0, 0, 0)
+                ),
+            )
+        )
 
     def arrays(self, begin=0):
         """Frames from index `begin` on, as a numpy record array (fields of FRAME)."""
         return np.array(self._rows[begin:], FRAME_FLAT).view(FRAME)
 
 
-FRAME_FLAT = np.dtype([("seq", "i8"), ("t_us", "i8"), ("host_s", "f8")]
-                      + [(f"s{i}", "u2") for i in range(6)]
-                      + [("raw_flags", "u1"), ("model_crc", "u4"), ("recentre_az_q7", "i2"), ("recentre_el_q7", "i2"),
-                         ("has_gaze", "?"), ("azimuth_q7", "i2"), ("elevation_q7", "i2"), ("gaze_flags", "u1"),
-                         ("infer_us", "u2")])
+FRAME_FLAT = np.dtype(
+    [("seq", "i8"), ("t_us", "i8"), ("host_s", "f8")]
+    + [(f"s{i}", "u2") for i in range(6)]
+    + [
+        ("raw_flags", "u1"),
+        ("model_crc", "u4"),
+        ("recentre_az_q7", "i2"),
+        ("recentre_el_q7", "i2"),
+        ("has_gaze", "?"),
+        ("azimuth_q7", "i2"),
+        ("elevation_q7", "i2"),
+        ("gaze_flags", "u1"),
+        ("infer_us", "u2"),
+    ]
+)
 # The same bytes with the arrays as arrays.
-FRAME = np.dtype([("seq", "i8"), ("t_us", "i8"), ("host_s", "f8"), ("features", "u2", (6,)), ("raw_flags", "u1"),
-                  ("model_crc", "u4"), ("recentre_q7", "i2", (2,)), ("has_gaze", "?"), ("gaze_q7", "i2", (2,)),
-                  ("gaze_flags", "u1"), ("infer_us", "u2")])
+FRAME = np.dtype(
+    [
+        ("seq", "i8"),
+        ("t_us", "i8"),
+        ("host_s", "f8"),
+        ("features", "u2", (6,)),
+        ("raw_flags", "u1"),
+        ("model_crc", "u4"),
+        ("recentre_q7", "i2", (2,)),
+        ("has_gaze", "?"),
+        ("gaze_q7", "i2", (2,)),
+        ("gaze_flags", "u1"),
+        ("infer_us", "u2"),
+    ]
+)
 assert FRAME.itemsize == FRAME_FLAT.itemsize
 
 
@@ -60,8 +100,8 @@ assert FRAME.itemsize == FRAME_FLAT.itemsize
 class Run:
     """A finished (or cut) run.
 
-    frames          record array [n] of FRAME: seq, t_us, host_s, features, raw_flags, model_crc, recentre_q7, has_gaze,
-                    gaze_q7 (azimuth, elevation in 1/128 deg), gaze_flags, infer_us
+    frames          record array [n] of FRAME: seq, t_us, host_s, features, raw_flags, model_crc, recentre_q7,
+                    has_gaze, gaze_q7 (azimuth, elevation in 1/128 deg), gaze_flags, infer_us
     onset_us        int64 [k], device time at which each target really appeared; k < n_targets when cut
     target_index    int64 [n], which target was up; -1 outside the plan
     lost, torn, bad frames missing by sequence number; with a part missing; with a bad CRC
@@ -124,7 +164,8 @@ def index_targets(t_us, onset_us, dwell_s):
 def run(device, screen, plan, gaze=False, progress=None, on_frame=None, on_target=None, cut=None):
     """Show every target of `plan` and keep every frame.
 
-    device     open Device; screen: see screen.py (opened here, closed by its owner); gaze: stream the gaze too
+    device     open Device; screen: see screen.py (opened here, closed by its owner); gaze: stream the gaze
+               too
     progress   called as progress(stage, done, total), stage "exposures" (s), then "targets"
     on_frame   called with every device.Frame, also those before the first target
     on_target  called with (index, Run so far of that target's frames) when a target's time is over
@@ -140,8 +181,17 @@ def run(device, screen, plan, gaze=False, progress=None, on_frame=None, on_targe
         frames = log.arrays(begin)
         onsets = np.array(screen.onsets_us() if onset_start is not None else [], np.int64)
         index = index_targets(frames["t_us"], onsets, plan.dwell_s)
-        return Run(plan, frames, onsets, index, device.lost - lost0, log.torn, device.bad - bad0,
-                   getattr(screen, "offset_us", None), notes)
+        return Run(
+            plan,
+            frames,
+            onsets,
+            index,
+            device.lost - lost0,
+            log.torn,
+            device.bad - bad0,
+            getattr(screen, "offset_us", None),
+            notes,
+        )
 
     device.set_stream(raw=True, gaze=gaze)
     try:
@@ -180,6 +230,7 @@ def run(device, screen, plan, gaze=False, progress=None, on_frame=None, on_targe
 def _wait_for_calm(stream, screen, on_frame, progress):
     """Look at the centre until no exposure has changed for CALM_S. Returns notes."""
     from ._core import lib
+
     first = last_change = None
     trouble = 0
     for frame in stream:
@@ -203,9 +254,11 @@ def _wait_for_calm(stream, screen, on_frame, progress):
             return ["the exposures were still changing when the targets began"]
         if late and calm:
             too = "much" if trouble & lib.SG_FLAG_SATURATED else "little"
-            raise CalibrationError(f"an LED collects too {too} light to be read",
-                                   "check that the headset sits in front of an open eye, away from sunlight, and that "
-                                   "every LED is wired; `sparsegaze info PORT` shows the exposures")
+            raise CalibrationError(
+                f"an LED collects too {too} light to be read",
+                "check that the headset sits in front of an open eye, away from sunlight, and that "
+                "every LED is wired; `sparsegaze info PORT` shows the exposures",
+            )
         if late:
             return ["some readings were saturated or starved when the targets began"]
     return []

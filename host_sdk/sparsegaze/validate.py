@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good is the gaze that the device computes: held-out targets, per-frame error, precision, loss, bit identity.
+"""How good is the gaze that the device computes: held-out targets, per-frame error, precision, loss, bit
+identity.
 
-Definitions. A frame is *settled* from settle_s after its target's onset to the next onset. Settled frames whose gaze
-has SG_FLAG_VALID count for the error; all other settled frames (blinks, out of range, saturated, no gaze) are data
-loss. Error of a frame: angle between the unit vectors of gaze and target. accuracy_deg, rms_s2s_deg, std_deg, bcea are
-ETDQualitizer's, per target, averaged over targets.
+Definitions. A frame is *settled* from settle_s after its target's onset to the next onset. Settled frames
+whose gaze has SG_FLAG_VALID count for the error; all other settled frames (blinks, out of range, saturated,
+no gaze) are data loss. Error of a frame: angle between the unit vectors of gaze and target. accuracy_deg,
+rms_s2s_deg, std_deg, bcea are ETDQualitizer's, per target, averaged over targets.
 """
+
 import os
 import tempfile
 from dataclasses import dataclass, field
@@ -41,11 +43,14 @@ class Validation:
 
     @property
     def bit_identical(self):
-        """True when every gaze frame equals what the host core computes from its raw frame (and there is one)."""
+        """True when every gaze frame equals what the host core computes from its raw frame (and there is
+        one).
+        """
         return self.compared > 0 and self.differing == 0
 
     def error_of(self, gaze_deg, against_deg=None):
-        """metrics.FrameError of any gaze [n, 2] over the counted frames; against_deg [n, 2], default the targets.
+        """metrics.FrameError of any gaze [n, 2] over the counted frames; against_deg [n, 2], default the
+        targets.
 
         For example the float64 process on the same samples: error_of(gp.predict(run.frames["features"])).
         """
@@ -62,14 +67,21 @@ class Validation:
             az, el = gaze[rows].T
             have = np.isfinite(az)
             accuracy = metrics.accuracy_deg(az, el, azimuth, elevation)[0]
-            table.append({
-                "target_az_deg": float(azimuth), "target_el_deg": float(elevation),
-                "gaze_az_deg": float(az[have].mean()) if have.any() else np.nan,
-                "gaze_el_deg": float(el[have].mean()) if have.any() else np.nan,
-                "mean_deg": float(self.error_deg[rows][have].mean()) if have.any() else np.nan,
-                "accuracy_deg": accuracy, "rms_s2s_deg": metrics.rms_s2s_deg(az, el),
-                "std_deg": metrics.std_deg(az, el), "bcea_deg2": metrics.bcea_deg2(az, el),
-                "data_loss_percent": metrics.data_loss_percent(az, el), "frames": int(rows.sum())})
+            table.append(
+                {
+                    "target_az_deg": float(azimuth),
+                    "target_el_deg": float(elevation),
+                    "gaze_az_deg": float(az[have].mean()) if have.any() else np.nan,
+                    "gaze_el_deg": float(el[have].mean()) if have.any() else np.nan,
+                    "mean_deg": float(self.error_deg[rows][have].mean()) if have.any() else np.nan,
+                    "accuracy_deg": accuracy,
+                    "rms_s2s_deg": metrics.rms_s2s_deg(az, el),
+                    "std_deg": metrics.std_deg(az, el),
+                    "bcea_deg2": metrics.bcea_deg2(az, el),
+                    "data_loss_percent": metrics.data_loss_percent(az, el),
+                    "frames": int(rows.sum()),
+                }
+            )
         return table
 
     def report(self):
@@ -83,40 +95,62 @@ class Validation:
 
         settled = int(self.settled.sum())
         accuracy = {
-            "mean_deg": error.mean_deg, "median_deg": error.median_deg, "p95_deg": error.p95_deg,
-            "frames": error.frames, "accuracy_deg": over_targets("accuracy_deg"),
-            "rms_s2s_deg": over_targets("rms_s2s_deg"), "std_deg": over_targets("std_deg"),
+            "mean_deg": error.mean_deg,
+            "median_deg": error.median_deg,
+            "p95_deg": error.p95_deg,
+            "frames": error.frames,
+            "accuracy_deg": over_targets("accuracy_deg"),
+            "rms_s2s_deg": over_targets("rms_s2s_deg"),
+            "std_deg": over_targets("std_deg"),
             "bcea_deg2": over_targets("bcea_deg2"),
-            "data_loss_percent": 100.0 * (settled - error.frames) / settled if settled else 100.0}
+            "data_loss_percent": 100.0 * (settled - error.frames) / settled if settled else 100.0,
+        }
         if self.true_deg is not None:
             accuracy["to_true_gaze_mean_deg"] = self.error_of(run.gaze_deg, self.true_deg).mean_deg
             accuracy["true_gaze_to_target_mean_deg"] = self.error_of(self.true_deg).mean_deg
         inside = run.target_index >= 0
         gaze = int(np.sum(run.frames["has_gaze"]))
         return {
-            "targets": len(table), "accuracy": accuracy,
-            "stream": {"seconds": run.seconds, "frames": int(inside.sum()), "gaze_frames": gaze,
-                       "rate_hz": run.rate_hz, "lost": run.lost, "torn": run.torn, "bad_crc": run.bad,
-                       "bit_identical": self.bit_identical, "compared": self.compared, "differing": self.differing,
-                       "exposure_changes": self.exposure_changes,
-                       "infer_us_mean": float(run.frames["infer_us"][run.frames["has_gaze"]].mean()) if gaze else None},
+            "targets": len(table),
+            "accuracy": accuracy,
+            "stream": {
+                "seconds": run.seconds,
+                "frames": int(inside.sum()),
+                "gaze_frames": gaze,
+                "rate_hz": run.rate_hz,
+                "lost": run.lost,
+                "torn": run.torn,
+                "bad_crc": run.bad,
+                "bit_identical": self.bit_identical,
+                "compared": self.compared,
+                "differing": self.differing,
+                "exposure_changes": self.exposure_changes,
+                "infer_us_mean": (
+                    float(run.frames["infer_us"][run.frames["has_gaze"]].mean()) if gaze else None
+                ),
+            },
             "model_crc": self.model.crc if self.model is not None else None,
-            "notes": list(self.notes) + list(run.notes)}
+            "notes": list(self.notes) + list(run.notes),
+        }
 
 
-def run(port, n_targets=25, seed=0, avoid_deg=None, screen=None, window=None, csv=None, truth=True, progress=None):
+def run(
+    port, n_targets=25, seed=0, avoid_deg=None, screen=None, window=None, csv=None, truth=True, progress=None
+):
     """Validate the device behind `port` (a name) and return a Validation.
 
     n_targets   held-out targets, one second each
-    seed        of the target plan; avoid_deg [m, 2] calibration targets to keep away from (default: those of the plan
-                that `calibrate` shows with this seed)
-    screen      see screen.py; None chooses: the simulated person of a virtual Nano, else a window (window: dict of
-                arguments of WindowScreen)
-    csv         path: the whole stream is kept there; truth: also ask a virtual Nano where the eye really looked
+    seed        of the target plan; avoid_deg [m, 2] calibration targets to keep away from (default: those of
+                the plan that `calibrate` shows with this seed)
+    screen      see screen.py; None chooses: the simulated person of a virtual Nano, else a window (window:
+                dict of arguments of WindowScreen)
+    csv         path: the whole stream is kept there; truth: also ask a virtual Nano where the eye really
+                looked
     Raises PortError, NoDeviceError, DeviceError (no model), CalibrationError.
     """
     from .device import Device
     from .screen import screen_for
+
     with Device(port) as device:
         shown = screen_for(device, **(window or {})) if screen is None else screen
         try:
@@ -130,6 +164,7 @@ def run(port, n_targets=25, seed=0, avoid_deg=None, screen=None, window=None, cs
 def measure(device, screen, plan, csv=None, truth=True, progress=None):
     """Validate an open device with a given plan on a given screen. Returns Validation; see `run`."""
     from .model import DeviceModel
+
     model = DeviceModel(device.read_model())
     control = getattr(screen, "control", None) if truth else None
     writer = None if csv is None else GazeCsv(csv, {"plan": plan.name, "model_crc": f"0x{model.crc:08X}"})
@@ -139,8 +174,9 @@ def measure(device, screen, plan, csv=None, truth=True, progress=None):
             handle, path = tempfile.mkstemp(prefix="sparsegaze-truth-", suffix=".csv")
             os.close(handle)
             control.truth(path)
-        done = session.run(device, screen, plan, gaze=True, progress=progress,
-                           on_frame=writer.add if writer else None)
+        done = session.run(
+            device, screen, plan, gaze=True, progress=progress, on_frame=writer.add if writer else None
+        )
         true_deg = None
         if control is not None:
             control.truth(None)
@@ -156,6 +192,7 @@ def measure(device, screen, plan, csv=None, truth=True, progress=None):
 def evaluate(done, model, true_deg=None):
     """Validation of a finished session.Run made with gaze=True and model (DeviceModel or None)."""
     from ._core import lib
+
     frames = done.frames
     gaze_valid = frames["has_gaze"] & ((frames["gaze_flags"] & lib.SG_FLAG_VALID) != 0)
     settled = done.settled
@@ -169,7 +206,9 @@ def evaluate(done, model, true_deg=None):
     if model is not None:
         same &= frames["model_crc"] == model.crc
     changes = int(np.sum((frames["raw_flags"] & lib.SG_FLAG_EXPOSURE) != 0))
-    return Validation(done, settled, counted, error, model, int(have.sum()), int(np.sum(have & ~same)), true_deg, changes)
+    return Validation(
+        done, settled, counted, error, model, int(have.sum()), int(np.sum(have & ~same)), true_deg, changes
+    )
 
 
 def read_truth(path, virtual_us):
@@ -181,7 +220,7 @@ def read_truth(path, virtual_us):
             try:
                 rows.append([float(cell) for cell in cells[:3]])
             except ValueError:
-                continue        # header
+                continue  # header
     table = np.array([row for row in rows if len(row) == 3], float).reshape(-1, 3)
     if len(table) < 2:
         return np.full((len(virtual_us), 2), np.nan)
@@ -190,21 +229,32 @@ def read_truth(path, virtual_us):
 
 
 def picture(validation, path, title="held-out targets"):
-    """Draw gaze against targets and the histogram of the error into a PNG file. Needs matplotlib (extra `pictures`)."""
+    """Draw gaze against targets and the histogram of the error into a PNG file. Needs matplotlib (extra
+    `pictures`).
+    """
     from .errors import SparsegazeError
+
     try:
         import matplotlib
+
         matplotlib.use("Agg")
         from matplotlib import pyplot
     except ImportError:
-        raise SparsegazeError("drawing needs matplotlib", 'install it: pip install "sparsegaze[pictures]"') from None
+        raise SparsegazeError(
+            "drawing needs matplotlib", 'install it: pip install "sparsegaze[pictures]"'
+        ) from None
     rows = validation.counted
     gaze, plan, report = validation.run.gaze_deg[rows], validation.run.plan.target_deg, validation.report()
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(11, 5.2), constrained_layout=True)
     left.plot(gaze[:, 0], gaze[:, 1], ".", ms=1.5, alpha=0.25, color="#3b6ea5", label="gaze, per frame")
     for row in validation.per_target():
-        left.plot([row["target_az_deg"], row["gaze_az_deg"]], [row["target_el_deg"], row["gaze_el_deg"]], "-",
-                  color="#c8553d", lw=1)
+        left.plot(
+            [row["target_az_deg"], row["gaze_az_deg"]],
+            [row["target_el_deg"], row["gaze_el_deg"]],
+            "-",
+            color="#c8553d",
+            lw=1,
+        )
     left.plot(plan[:, 0], plan[:, 1], "+", ms=9, mew=1.6, color="black", label="target")
     left.set(xlabel="azimuth (deg, + right)", ylabel="elevation (deg, + up)", title=title, aspect="equal")
     left.legend(loc="upper right", fontsize=8)
@@ -212,13 +262,18 @@ def picture(validation, path, title="held-out targets"):
     accuracy = report["accuracy"]
     for key, style in (("mean_deg", "-"), ("median_deg", "--"), ("p95_deg", ":")):
         right.axvline(accuracy[key], ls=style, color="#c8553d", label=f"{key[:-4]} {accuracy[key]:.2f} deg")
-    right.set(xlabel="error to the target, per frame (deg)", ylabel="frames",
-              title=f"{accuracy['frames']} frames, data loss {accuracy['data_loss_percent']:.1f} %")
+    right.set(
+        xlabel="error to the target, per frame (deg)",
+        ylabel="frames",
+        title=f"{accuracy['frames']} frames, data loss {accuracy['data_loss_percent']:.1f} %",
+    )
     right.legend(fontsize=9)
     try:
         figure.savefig(path, dpi=130)
     except OSError as error:
-        raise SparsegazeError(f"cannot write {path}: {error.strerror}", "choose another place with --png") from None
+        raise SparsegazeError(
+            f"cannot write {path}: {error.strerror}", "choose another place with --png"
+        ) from None
     finally:
         pyplot.close(figure)
 
@@ -226,7 +281,7 @@ def picture(validation, path, title="held-out targets"):
 def _forget(control, path):
     try:
         control.truth(None)
-    except Exception:       # the virtual Nano is gone: its file is closed with it
+    except Exception:  # the virtual Nano is gone: its file is closed with it
         pass
     try:
         os.unlink(path)

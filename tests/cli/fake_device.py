@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stand-in for an open Device and the person in front of it: linear optics, exact, in device time, instantly.
+"""A stand-in for an open Device and the person in front of it: linear optics, exact, in device time,
+instantly.
 
 For what a run of targets does with its frames. The real chain is tested on the virtual Nano.
 """
+
 from collections import namedtuple
 from types import SimpleNamespace
 
@@ -15,21 +17,33 @@ from sparsegaze.model import DeviceModel
 from sparsegaze.wire import Gaze, Raw, Recentre, lib
 
 FRAME_US = 3600
-OPTICS = np.array([[60, 10], [-55, 20], [15, -70], [-20, 60], [45, 45], [-40, -40]], float)    # feature steps per degree
+OPTICS = np.array(
+    [[60, 10], [-55, 20], [15, -70], [-20, 60], [45, 45], [-40, -40]], float
+)  # feature steps per degree
 MIDDLE = 30000
 Pong = namedtuple("Pong", "rx_us tx_us")
 
 
 def linear_model(generation=1, inverse=None, n_vectors=64):
-    """The DeviceModel of gaze = inverse (feature - MIDDLE); inverse [2, 6] deg per step, default that of OPTICS."""
+    """The DeviceModel of gaze = inverse (feature - MIDDLE); inverse [2, 6] deg per step, default that of
+    OPTICS.
+    """
     # s = (feature - offset) / 2
     inverse = np.linalg.pinv(OPTICS) if inverse is None else inverse
-    unit = 2.0 ** -24
+    unit = 2.0**-24
     offset = MIDDLE - 4095
     trend = np.round(2 * inverse / unit).astype(np.int64)
     bias = np.round(inverse @ np.full(6, offset - MIDDLE) / unit).astype(np.int64)
-    return DeviceModel.from_parts(np.full(6, offset), np.full(6, 2048), bias, trend, np.zeros((n_vectors, 6), np.int64),
-                                  np.zeros((n_vectors, 2), np.int64), 8, generation=generation)
+    return DeviceModel.from_parts(
+        np.full(6, offset),
+        np.full(6, 2048),
+        bias,
+        trend,
+        np.zeros((n_vectors, 6), np.int64),
+        np.zeros((n_vectors, 2), np.int64),
+        8,
+        generation=generation,
+    )
 
 
 def fit_linear(recording, n_vectors=64):
@@ -37,8 +51,11 @@ def fit_linear(recording, n_vectors=64):
     x = recording.features[recording.valid].astype(float) - MIDDLE
     inverse = np.linalg.lstsq(x, recording.target_deg[recording.valid], rcond=1e-3)[0].T
     miss = x @ inverse.T - recording.target_deg[recording.valid]
-    return SimpleNamespace(gp=None, model=linear_model(0, inverse, n_vectors),
-                           report={"loo_rms_deg": float(np.sqrt((miss ** 2).sum(axis=1).mean()))})
+    return SimpleNamespace(
+        gp=None,
+        model=linear_model(0, inverse, n_vectors),
+        report={"loo_rms_deg": float(np.sqrt((miss**2).sum(axis=1).mean()))},
+    )
 
 
 class FakeScreen:
@@ -75,15 +92,32 @@ class FakeScreen:
 class FakeDevice:
     """What session, capture, validate, recentre and live use of Device.
 
-    model       DeviceModel or None;  noise feature steps rms;  shift_deg: where the eye really looks, off the target
+    model       DeviceModel or None;  noise feature steps rms;  shift_deg: where the eye really looks, off the
+                target
     blinks      [(begin_us, end_us)];  raw_flags: function t_us -> flags
     unplug_us   the cable is pulled then;  interrupt_us: Ctrl-C then;  drop: sequence numbers that get lost
     spoil       function (seq, Gaze) -> Gaze, for gazes that the host would not compute
     """
 
-    def __init__(self, model=None, noise=8.0, shift_deg=(0.0, 0.0), blinks=(), raw_flags=None, unplug_us=None,
-                 interrupt_us=None, drop=(), spoil=None, seed=0):
-        self.model, self.noise, self.shift, self.blinks = model, noise, np.array(shift_deg, float), list(blinks)
+    def __init__(
+        self,
+        model=None,
+        noise=8.0,
+        shift_deg=(0.0, 0.0),
+        blinks=(),
+        raw_flags=None,
+        unplug_us=None,
+        interrupt_us=None,
+        drop=(),
+        spoil=None,
+        seed=0,
+    ):
+        self.model, self.noise, self.shift, self.blinks = (
+            model,
+            noise,
+            np.array(shift_deg, float),
+            list(blinks),
+        )
         self.raw_flags = raw_flags or (lambda t_us: 0)
         self.unplug_us, self.interrupt_us, self.drop, self.spoil = unplug_us, interrupt_us, set(drop), spoil
         self.rng = np.random.default_rng(seed)
@@ -123,7 +157,7 @@ class FakeDevice:
     def eye_deg(self, t_us):
         now = (0.0, 0.0)
         for onset, target in self.schedule:
-            if t_us >= onset + 250_000:     # latency and saccade
+            if t_us >= onset + 250_000:  # latency and saccade
                 now = target
         return np.array(now) + self.shift
 
@@ -144,10 +178,19 @@ class FakeDevice:
                 signal += 1500
             feature = np.clip(np.round(signal), 0, 65535).astype(np.uint16)
             flags = self.raw_flags(self.t_us)
-            q7, gaze_flags = replay.infer(self.model, feature[None], np.array([flags], np.uint8), self.offset_q7)
+            q7, gaze_flags = replay.infer(
+                self.model, feature[None], np.array([flags], np.uint8), self.offset_q7
+            )
             gaze = Gaze(self.t_us, int(q7[0, 0]), int(q7[0, 1]), 700, int(gaze_flags[0]), 0)
             if self.spoil:
                 gaze = self.spoil(self.seq, gaze)
             crc = self.model.crc if self.model else 0
             raw = Raw(self.t_us, crc, *self.offset_q7, tuple(int(v) for v in feature), 1500, flags, 0)
-            yield Frame(self.seq, self.t_us, self.t_us * 1e-6 + 5.0, raw if raw_on else None, gaze if gaze_on else None, None)
+            yield Frame(
+                self.seq,
+                self.t_us,
+                self.t_us * 1e-6 + 5.0,
+                raw if raw_on else None,
+                gaze if gaze_on else None,
+                None,
+            )

@@ -1,42 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line: help, one JSON object, one error line with its remedy, exit codes, complete files."""
-import contextlib
+
 import json
 import os
-import signal
 import subprocess
 import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fake_device import FakeDevice, fit_linear, linear_model
+from fake_device import linear_model
 
 from sparsegaze import cli
 from sparsegaze.errors import FlashError, ModelError
 from sparsegaze.recording import Recording
 
 
-@pytest.fixture
-def fake(monkeypatch):
-    """fake(**options of FakeDevice): every port has this device behind it. Returns the device."""
-    def put(model=None, **options):
-        device = FakeDevice(model, **options)
-        monkeypatch.setattr("sparsegaze.device.Device", lambda port, *_: device)
-        monkeypatch.setattr("sparsegaze.screen.screen_for", lambda *_, **__: device.screen)
-        monkeypatch.setattr("sparsegaze.distil.fit_recording", fit_linear)
-        monkeypatch.setattr("sparsegaze.transport.open_link", lambda port, *_: contextlib.nullcontext(device.link))
-        return device
-    return put
-
-
 def program(*args, **options):
     """The program in a process of its own."""
-    return subprocess.run([sys.executable, "-m", "sparsegaze.cli", *map(str, args)], capture_output=True, text=True,
-                          timeout=60, **options)
+    return subprocess.run(
+        [sys.executable, "-m", "sparsegaze.cli", *map(str, args)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        **options,
+    )
 
 
-# help ---------------------------------------------------------------------------------------------------------------
+
 
 def test_help_loads_neither_numerics_nor_serial_nor_terminal_code():
     done = program("--help", env={**os.environ, "PYTHONPROFILEIMPORTTIME": "1"})
@@ -62,10 +53,10 @@ def test_every_command_has_a_line_in_the_list(command):
 
 def test_version(command):
     from sparsegaze import __version__
+
     assert __version__ in command("--version")[1]
 
 
-# errors -------------------------------------------------------------------------------------------------------------
 
 CASES = [
     (["info", "/dev/no-such-port"], 1, "no such port", "sparsegaze list"),
@@ -109,7 +100,11 @@ def broken_files(tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize("args, expected, what, remedy", CASES, ids=lambda value: " ".join(value) if isinstance(value, list) else None)
+@pytest.mark.parametrize(
+    "args, expected, what, remedy",
+    CASES,
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
 def test_bad_input_is_one_line_with_a_remedy(command, broken_files, args, expected, what, remedy):
     args = [arg.format(tmp=broken_files) for arg in args]
     code, out, err = command(*args)
@@ -119,7 +114,11 @@ def test_bad_input_is_one_line_with_a_remedy(command, broken_files, args, expect
     assert what in said[0] and remedy in said[0].partition(" — ")[2]
 
 
-@pytest.mark.parametrize("args, expected, what, remedy", CASES, ids=lambda value: " ".join(value) if isinstance(value, list) else None)
+@pytest.mark.parametrize(
+    "args, expected, what, remedy",
+    CASES,
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
 def test_bad_input_with_json_is_also_one_object(command_json, broken_files, args, expected, what, remedy):
     code, data, err = command_json(*[arg.format(tmp=broken_files) for arg in args])
     assert code == expected and set(data) == {"error", "remedy"}
@@ -148,7 +147,7 @@ def test_a_missing_part_points_to_doctor(command, monkeypatch):
     assert code == 1 and "sparsegaze doctor" in err
 
 
-# results ------------------------------------------------------------------------------------------------------------
+
 
 def test_record_fit_and_replay_from_one_recording(command_json, fake, tmp_path):
     fake()
@@ -171,7 +170,12 @@ def test_stream_csv_replays_bit_identical_and_a_changed_gaze_does_not(command_js
     gaze, model = tmp_path / "gaze.csv", tmp_path / "eye.sgm"
     device.model.save(model)
     code, data, _ = command_json("stream", "PORT", "--seconds", "3", "--csv", gaze)
-    assert code == 0 and data["seconds"] == pytest.approx(3.0, abs=0.01) and data["frames"] == 834 and data["lost"] == 0
+    assert (
+        code == 0
+        and data["seconds"] == pytest.approx(3.0, abs=0.01)
+        and data["frames"] == 834
+        and data["lost"] == 0
+    )
     code, data, _ = command_json("replay", gaze, "--model", model)
     assert code == 0 and data["identical"] is True and data["compared"] == 834 and data["valid"] < 834
     lines = gaze.read_text().splitlines()
@@ -189,7 +193,9 @@ def test_stream_to_stdout_is_pure_csv(command, fake):
     fake(linear_model())
     code, out, err = command("stream", "PORT", "--seconds", "1", "--csv", "-")
     lines = [line for line in out.splitlines() if not line.startswith("#")]
-    assert code == 0 and lines[0].startswith("t_us,host_time_s,seq,azimuth_deg,elevation_deg,flags,s0,s1,s2,s3,s4,s5")
+    assert code == 0 and lines[0].startswith(
+        "t_us,host_time_s,seq,azimuth_deg,elevation_deg,flags,s0,s1,s2,s3,s4,s5"
+    )
     assert all(line.count(",") == lines[0].count(",") for line in lines) and len(lines) == 279
     assert "278 frames" in err
 
@@ -202,7 +208,9 @@ def test_stream_without_a_model_says_that_nothing_is_valid(command_json, fake):
 
 def test_validate_reports_and_draws(command_json, command, fake, tmp_path):
     fake(linear_model())
-    code, data, err = command_json("validate", "PORT", "--targets", "4", "--png", tmp_path / "v.png", "--csv", tmp_path / "v.csv")
+    code, data, err = command_json(
+        "validate", "PORT", "--targets", "4", "--png", tmp_path / "v.png", "--csv", tmp_path / "v.csv"
+    )
     assert code == 0 and data["stream"]["bit_identical"] is True and len(data["per_target"]) == 4
     assert (tmp_path / "v.png").read_bytes()[:4] == b"\x89PNG" and (tmp_path / "v.csv").exists()
     code, out, _ = command("validate", "PORT", "--targets", "2")
@@ -210,7 +218,10 @@ def test_validate_reports_and_draws(command_json, command, fake, tmp_path):
 
 
 def test_validate_of_a_device_that_computes_something_else_fails(command_json, fake):
-    fake(linear_model(), spoil=lambda seq, gaze: gaze._replace(elevation_deg_q7=gaze.elevation_deg_q7 + (seq == 1500)))
+    fake(
+        linear_model(),
+        spoil=lambda seq, gaze: gaze._replace(elevation_deg_q7=gaze.elevation_deg_q7 + (seq == 1500)),
+    )
     code, data, _ = command_json("validate", "PORT", "--targets", "4")
     assert code == 1 and data["stream"]["differing"] == 1
 
@@ -229,16 +240,33 @@ def fake_upload(monkeypatch, device, error=None):
         if error:
             raise error
         device.model = model.with_generation(7)
-        return SimpleNamespace(_asdict=lambda: {"slot": 1, "generation": 7, "crc": device.model.crc}, slot=1, generation=7,
-                               crc=device.model.crc)
+        return SimpleNamespace(
+            _asdict=lambda: {"slot": 1, "generation": 7, "crc": device.model.crc},
+            slot=1,
+            generation=7,
+            crc=device.model.crc,
+        )
+
     monkeypatch.setattr("sparsegaze.store.upload", upload)
 
 
-def test_calibrate_does_everything_and_keeps_recording_model_and_report(command_json, fake, monkeypatch, tmp_path):
+def test_calibrate_does_everything_and_keeps_recording_model_and_report(
+    command_json, fake, monkeypatch, tmp_path
+):
     device = fake()
     fake_upload(monkeypatch, device)
-    code, data, _ = command_json("calibrate", "PORT", "--targets", "40", "--vectors", "24", "--validation", "9",
-                                 "--save", tmp_path / "kept")
+    code, data, _ = command_json(
+        "calibrate",
+        "PORT",
+        "--targets",
+        "40",
+        "--vectors",
+        "24",
+        "--validation",
+        "9",
+        "--save",
+        tmp_path / "kept",
+    )
     assert code == 0
     assert data["used_targets"] == 40 and data["n_vectors"] == 24 and data["validation_targets"] == 9
     assert data["crc_host"] == data["crc_device"] == device.model.crc
@@ -248,74 +276,22 @@ def test_calibrate_does_everything_and_keeps_recording_model_and_report(command_
     assert (tmp_path / "kept" / "model.sgm").read_bytes() == device.model.image
 
 
-@pytest.mark.parametrize("error", [FlashError("the bootloader did not answer", "press reset"),
-                                   ModelError("too large", "fewer vectors")])
-def test_a_failed_upload_keeps_recording_and_model_and_says_where(command_json, fake, monkeypatch, tmp_path, error):
+@pytest.mark.parametrize(
+    "error",
+    [FlashError("the bootloader did not answer", "press reset"), ModelError("too large", "fewer vectors")],
+)
+def test_a_failed_upload_keeps_recording_and_model_and_says_where(
+    command_json, fake, monkeypatch, tmp_path, error
+):
     device = fake()
     fake_upload(monkeypatch, device, error)
-    code, data, _ = command_json("calibrate", "PORT", "--targets", "24", "--vectors", "16", "--save", tmp_path / "kept")
-    assert code == 1 and data["error"] == error.message and str(tmp_path / "kept" / "recording.csv") in data["remedy"]
+    code, data, _ = command_json(
+        "calibrate", "PORT", "--targets", "24", "--vectors", "16", "--save", tmp_path / "kept"
+    )
+    assert (
+        code == 1
+        and data["error"] == error.message
+        and str(tmp_path / "kept" / "recording.csv") in data["remedy"]
+    )
     assert len(Recording.read(tmp_path / "kept" / "recording.csv")) > 5000
     assert (tmp_path / "kept" / "model.sgm").exists()
-
-
-# interruptions ------------------------------------------------------------------------------------------------------
-
-def test_ctrl_c_in_a_recording_exits_130_and_leaves_a_complete_file(command_json, fake, tmp_path):
-    device = fake(interrupt_us=9_000_000)
-    code, data, err = command_json("record", "PORT", "-o", tmp_path / "eye.csv")
-    assert code == 130 and data["error"] == "interrupted" and "sparsegaze: interrupted" in err
-    assert Recording.read(tmp_path / "eye.csv").valid.sum() > 500
-    assert device.screen.closed and device.stream[-1] == "closed"
-
-
-def test_ctrl_c_ends_a_stream_with_its_summary_and_exits_130(command_json, fake, tmp_path):
-    fake(linear_model(), interrupt_us=4_000_000)
-    code, data, _ = command_json("stream", "PORT", "--csv", tmp_path / "gaze.csv")
-    assert code == 130 and data["interrupted"] is True and data["frames"] > 500
-    rows = (tmp_path / "gaze.csv").read_text()
-    assert rows.endswith("\n") and sum(not line.startswith("#") for line in rows.splitlines()) == data["frames"] + 1
-
-
-def test_a_pulled_cable_during_a_stream_is_one_line_and_the_csv_complete(command_json, fake, tmp_path):
-    fake(linear_model(), unplug_us=4_000_000)
-    code, data, _ = command_json("stream", "PORT", "--csv", tmp_path / "gaze.csv")
-    assert code == 1 and "gone" in data["error"] and data["remedy"]
-    assert (tmp_path / "gaze.csv").read_text().endswith("\n")
-
-
-def test_a_signal_during_a_real_process_ends_it_in_order(tmp_path):
-    script = ("import sys; sys.path.insert(0, sys.argv[1])\n"
-              "from fake_device import FakeDevice, fit_linear, linear_model\n"
-              "import sparsegaze.device, sparsegaze.cli\n"
-              "sparsegaze.device.Device = lambda port: FakeDevice(linear_model())\n"
-              "sparsegaze.cli.main(sys.argv[2:])\n")
-    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
-        path = tmp_path / f"{code}.csv"
-        process = subprocess.Popen([sys.executable, "-c", script, os.path.dirname(__file__), "stream", "PORT", "--csv",
-                                    str(path), "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        try:
-            while not path.exists() or path.stat().st_size < 2000:
-                assert process.poll() is None, process.stderr.read()
-            process.send_signal(number)
-            out, err = process.communicate(timeout=60)
-        finally:
-            process.kill()
-        assert process.returncode == code and "Traceback" not in err
-        assert json.loads(out)["interrupted"] is True
-        assert path.read_text().endswith("\n")
-
-
-def test_a_reader_that_goes_away_is_no_traceback(tmp_path):
-    script = ("import sys; sys.path.insert(0, sys.argv[1])\n"
-              "from fake_device import FakeDevice, fit_linear, linear_model\n"
-              "import sparsegaze.device, sparsegaze.cli\n"
-              "sparsegaze.device.Device = lambda port: FakeDevice(linear_model())\n"
-              "sparsegaze.cli.main(sys.argv[2:])\n")
-    process = subprocess.Popen([sys.executable, "-c", script, os.path.dirname(__file__), "stream", "PORT", "--csv", "-"],
-                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout.readline()
-    process.stdout.close()
-    err = process.stderr.read()
-    assert process.wait(timeout=60) == 1
-    assert "Traceback" not in err and "BrokenPipe" not in err

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs of targets: recording while it happens, waiting for exposures, interruptions, validation, recentre."""
+
 import numpy as np
 import pytest
 from fake_device import FRAME_US, FakeDevice, linear_model
@@ -19,7 +20,9 @@ def test_a_recording_holds_the_plan_with_settling_marked(tmp_path, plan):
     device = FakeDevice()
     taken = capture.run(device, device.screen, plan, tmp_path / "new" / "eye.csv", {"who": "nobody"})
     read = Recording.read(tmp_path / "new" / "eye.csv")
-    assert np.array_equal(read.features, taken.recording.features) and np.array_equal(read.valid, taken.recording.valid)
+    assert np.array_equal(read.features, taken.recording.features) and np.array_equal(
+        read.valid, taken.recording.valid
+    )
     assert read.meta["who"] == "nobody" and read.meta["used_targets"] == "12"
     assert len(read) == pytest.approx(12 * 1e6 / FRAME_US, abs=2)
     assert 0.45 < read.valid.mean() < 0.51
@@ -35,8 +38,10 @@ def test_valid_frames_show_the_eye_on_its_target(plan):
         assert len(np.unique(run.recording.features[rows], axis=0)) == 1
 
 
-@pytest.mark.parametrize("fault, error", [({"interrupt_us": 8_000_000}, KeyboardInterrupt),
-                                          ({"unplug_us": 8_000_000}, DisconnectedError)])
+@pytest.mark.parametrize(
+    "fault, error",
+    [({"interrupt_us": 8_000_000}, KeyboardInterrupt), ({"unplug_us": 8_000_000}, DisconnectedError)],
+)
 def test_a_run_cut_short_leaves_a_complete_file_of_the_targets_so_far(tmp_path, plan, fault, error):
     device = FakeDevice(**fault)
     with pytest.raises(error):
@@ -56,9 +61,13 @@ def test_rows_of_a_target_are_on_disk_before_the_next_target_is_over(tmp_path, p
         def frames(self, timeout_s=2.0):
             for frame in super().frames(timeout_s):
                 path = tmp_path / "eye.csv"
-                seen.append(sum(not line.startswith("#") for line in path.read_text().splitlines()) - 1
-                            if path.exists() and frame.seq % 50 == 0 else 0)
+                seen.append(
+                    sum(not line.startswith("#") for line in path.read_text().splitlines()) - 1
+                    if path.exists() and frame.seq % 50 == 0
+                    else 0
+                )
                 yield frame
+
     device = Watching()
     capture.run(device, device.screen, plan, tmp_path / "eye.csv")
     grown = np.maximum.accumulate(seen)
@@ -122,7 +131,10 @@ def test_a_perfect_device_validates_as_bit_identical_and_exact(held_out):
     report = done.report()
     assert done.bit_identical and report["stream"]["compared"] == len(done.run.frames) > 1600
     assert report["accuracy"]["mean_deg"] < 0.15 and report["accuracy"]["data_loss_percent"] == 0.0
-    assert report["stream"]["rate_hz"] == pytest.approx(1e6 / FRAME_US, rel=1e-3) and report["stream"]["lost"] == 0
+    assert (
+        report["stream"]["rate_hz"] == pytest.approx(1e6 / FRAME_US, rel=1e-3)
+        and report["stream"]["lost"] == 0
+    )
     assert len(done.per_target()) == 6
 
 
@@ -136,15 +148,21 @@ def test_an_error_of_two_degrees_is_measured_as_two_degrees(held_out):
 
 def test_one_wrong_bit_in_one_gaze_frame_is_found(held_out):
     wrong = 1500
-    device = FakeDevice(linear_model(), spoil=lambda seq, gaze: gaze._replace(azimuth_deg_q7=gaze.azimuth_deg_q7 ^ 1)
-                        if seq == wrong else gaze)
+    device = FakeDevice(
+        linear_model(),
+        spoil=lambda seq, gaze: (
+            gaze._replace(azimuth_deg_q7=gaze.azimuth_deg_q7 ^ 1) if seq == wrong else gaze
+        ),
+    )
     done = validate.measure(device, device.screen, held_out)
     assert done.differing == 1 and not done.bit_identical
 
 
 def test_a_wrong_flag_in_one_gaze_frame_is_found(held_out):
-    device = FakeDevice(linear_model(), spoil=lambda seq, gaze: gaze._replace(flags=gaze.flags | lib.SG_FLAG_TRIAL)
-                        if seq == 1500 else gaze)
+    device = FakeDevice(
+        linear_model(),
+        spoil=lambda seq, gaze: gaze._replace(flags=gaze.flags | lib.SG_FLAG_TRIAL) if seq == 1500 else gaze,
+    )
     assert validate.measure(device, device.screen, held_out).differing == 1
 
 
@@ -158,15 +176,23 @@ def test_frames_of_another_model_are_not_called_identical(held_out):
 
 def test_a_recentre_during_the_stream_stays_bit_identical(held_out):
     device = FakeDevice(linear_model())
-    run = session.run(device, device.screen, held_out, gaze=True,
-                      on_frame=lambda frame: device.recentre((1.5, -2.0)) if frame.seq == 1500 else None)
+    run = session.run(
+        device,
+        device.screen,
+        held_out,
+        gaze=True,
+        on_frame=lambda frame: device.recentre((1.5, -2.0)) if frame.seq == 1500 else None,
+    )
     assert len(np.unique(run.frames["recentre_q7"], axis=0)) == 2
     assert validate.evaluate(run, device.model).bit_identical
 
 
 def test_invalid_frames_are_data_loss_and_never_error(held_out):
-    device = FakeDevice(linear_model(), noise=0, raw_flags=lambda t: lib.SG_FLAG_STARVED
-                        if 5_000_000 < t and 400_000 < t % 1_000_000 < 650_000 else 0)
+    device = FakeDevice(
+        linear_model(),
+        noise=0,
+        raw_flags=lambda t: lib.SG_FLAG_STARVED if 5_000_000 < t and 400_000 < t % 1_000_000 < 650_000 else 0,
+    )
     report = validate.measure(device, device.screen, held_out).report()
     assert 15 < report["accuracy"]["data_loss_percent"] < 60
     assert report["accuracy"]["mean_deg"] < 0.05
@@ -185,8 +211,11 @@ def test_nothing_valid_reports_total_loss_and_no_number_for_the_error(held_out):
 
 
 def test_true_gaze_is_read_at_the_time_of_each_frame(tmp_path):
-    (tmp_path / "truth.csv").write_text("us,az,el,pupil_mm,lid,target_az,target_el\n" + "".join(
-        f"{1000 * i},{0.01 * i},{-0.02 * i},3.5,1,0,0\n" for i in range(100)) + "99500,nonsense\n")
+    (tmp_path / "truth.csv").write_text(
+        "us,az,el,pupil_mm,lid,target_az,target_el\n"
+        + "".join(f"{1000 * i},{0.01 * i},{-0.02 * i},3.5,1,0,0\n" for i in range(100))
+        + "99500,nonsense\n"
+    )
     deg = validate.read_truth(tmp_path / "truth.csv", np.array([500, 50_250, 200_000]))
     assert np.allclose(deg[:2], [[0.005, -0.01], [0.5025, -1.005]]) and np.isnan(deg[2]).all()
 
@@ -209,14 +238,22 @@ def test_recentre_on_another_point_than_the_centre():
 
 
 def test_recentre_waits_for_a_blink_to_pass():
-    device = FakeDevice(linear_model(), shift_deg=(2.0, 0.0), raw_flags=lambda t: lib.SG_FLAG_STARVED
-                        if 2_700_000 < t < 3_500_000 else 0)
+    device = FakeDevice(
+        linear_model(),
+        shift_deg=(2.0, 0.0),
+        raw_flags=lambda t: lib.SG_FLAG_STARVED if 2_700_000 < t < 3_500_000 else 0,
+    )
     assert np.allclose(recentre.run(device, device.screen).after_deg, (-2.0, 0.0), atol=0.1)
 
 
-@pytest.mark.parametrize("options, word", [
-    (dict(raw_flags=lambda t: lib.SG_FLAG_STARVED), "valid gaze"), (dict(noise=1500.0), "wandered"),
-    (dict(shift_deg=(34.0, 0.0)), "valid gaze|headset shift")])
+@pytest.mark.parametrize(
+    "options, word",
+    [
+        (dict(raw_flags=lambda t: lib.SG_FLAG_STARVED), "valid gaze"),
+        (dict(noise=1500.0), "wandered"),
+        (dict(shift_deg=(34.0, 0.0)), "valid gaze|headset shift"),
+    ],
+)
 def test_recentre_without_a_steady_gaze_leaves_the_offset_alone(options, word):
     device = FakeDevice(linear_model(), **options)
     device.recentre((1.0, 0.0))

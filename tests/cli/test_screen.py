@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Screens: geometry of a real display, targets in a window under SDL's dummy driver, the simulated person's clock."""
+"""Screens: geometry of a real display, targets in a window under SDL's dummy driver, the simulated person's
+clock.
+"""
+
 import math
 from types import SimpleNamespace
 
@@ -93,6 +96,7 @@ def test_a_calibration_runs_in_a_window_and_labels_frames_by_what_was_drawn(wind
 
     class Person(WindowScreen):
         """Follows the dot that is really on the screen."""
+
         def __init__(self):
             self.__dict__ = window.__dict__
 
@@ -114,10 +118,14 @@ def test_a_calibration_runs_in_a_window_and_labels_frames_by_what_was_drawn(wind
 @pytest.mark.parametrize("what", ["escape", "close"])
 def test_escape_and_closing_the_window_interrupt(window, what):
     import pygame
+
     window.start([(0.0, 0.0)], [0], 1.0)
     window.tick(0)
-    pygame.event.post(pygame.event.Event(pygame.QUIT) if what == "close" else
-                      pygame.event.Event(pygame.KEYDOWN, key=pygame.K_ESCAPE))
+    pygame.event.post(
+        pygame.event.Event(pygame.QUIT)
+        if what == "close"
+        else pygame.event.Event(pygame.KEYDOWN, key=pygame.K_ESCAPE)
+    )
     with pytest.raises(KeyboardInterrupt):
         window.tick(100_000)
 
@@ -137,7 +145,9 @@ def test_without_pygame_the_remedy_is_the_extra(monkeypatch):
 
 
 class Control:
-    """A virtual Nano's control socket whose clock runs `ahead` us behind device time; each look takes 300 us."""
+    """A virtual Nano's control socket whose clock runs `ahead` us behind device time; each look takes 300
+    us.
+    """
 
     def __init__(self, ahead):
         self.us, self.ahead, self.log = 50_000_000.0, ahead, []

@@ -1,21 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which frames are used: synthetic fixations with drift, noise, blinks, other people's gaze."""
+
 import numpy as np
 import pytest
 
 from sparsegaze import selection, targets
 
 FRAME_US = 3600
-MIX = np.array([[60, 10], [-55, 20], [15, -70], [-20, 60], [45, 45], [-40, -40]], float)    # feature steps per degree
+MIX = np.array(
+    [[60, 10], [-55, 20], [15, -70], [-20, 60], [45, 45], [-40, -40]], float
+)  # feature steps per degree
 
 
 def centre_of(target_deg):
     linear = MIX @ np.asarray(target_deg)
-    return 30000 + linear + 0.006 * linear ** 2 / 10
+    return 30000 + linear + 0.006 * linear**2 / 10
 
 
 class Recorded:
-    """A run of synthetic fixations: noise, slow drift of the eye, and whatever `spoil` does to the eye or features."""
+    """A run of synthetic fixations: noise, slow drift of the eye, and whatever `spoil` does to the eye or
+    features.
+    """
 
     def __init__(self, plan=None, seed=0, noise=15.0, spoil=None):
         rng = np.random.default_rng(seed)
@@ -40,11 +45,18 @@ class Recorded:
         since = (self.t_us - begin) * 1e-6
         shut = np.clip(np.minimum(since / 0.06, (length_s - since) / 0.14), 0, 1)
         self.features += shut[:, None] * octaves * 4096 * np.array([1, 0.8, 1.2, 0.5, -0.3, 0.9])
-        self.blinking |= shut * octaves * 1.2 > 0.045     # less is a degree or two, and far below any real lid
+        self.blinking |= shut * octaves * 1.2 > 0.045  # less is a degree or two, and far below any real lid
 
     def select(self):
-        return selection.select(self.t_us, np.clip(self.features, 0, 65535).astype(np.uint16), self.flagged, self.index,
-                                self.onset_us, self.plan.target_deg, self.plan.settle_s)
+        return selection.select(
+            self.t_us,
+            np.clip(self.features, 0, 65535).astype(np.uint16),
+            self.flagged,
+            self.index,
+            self.onset_us,
+            self.plan.target_deg,
+            self.plan.settle_s,
+        )
 
 
 def test_a_clean_run_keeps_nearly_every_settled_frame_and_no_other():
@@ -99,9 +111,10 @@ def test_saturated_and_starved_frames_are_left_out():
 def test_a_person_who_looked_elsewhere_loses_that_target_only():
     def look_away(run, eye, _):
         eye[run.index == 12] = -eye[run.index == 12] + 3.0
+
     run = Recorded(seed=7, spoil=look_away)
     away = np.hypot(*(run.plan.target_deg[12] * 2 - 3.0))
-    assert away > 10        # else this seed proves nothing
+    assert away > 10  # else this seed proves nothing
     chosen = run.select()
     assert not chosen.valid[run.index == 12].any()
     assert chosen.counts()["inattentive"] > 100
@@ -112,6 +125,7 @@ def test_microsaccades_of_a_tenth_of_a_degree_cost_nothing():
     def tremble(run, eye, _):
         since = run.t_us - run.onset_us[run.index]
         eye[(since > 700_000) & (since < 850_000)] += 0.1
+
     chosen = Recorded(seed=8, spoil=tremble).select()
     assert chosen.used_targets == 40
     assert chosen.valid.mean() > 0.45
@@ -127,12 +141,26 @@ def test_noise_estimate_ignores_blinks_and_drift():
 def test_a_cut_run_selects_what_is_there():
     run = Recorded(seed=10)
     k = int(np.searchsorted(run.index, 20)) + 60
-    chosen = selection.select(run.t_us[:k], run.features[:k].astype(np.uint16), run.flagged[:k], run.index[:k],
-                              run.onset_us[:21], run.plan.target_deg[:21], 0.5)
+    chosen = selection.select(
+        run.t_us[:k],
+        run.features[:k].astype(np.uint16),
+        run.flagged[:k],
+        run.index[:k],
+        run.onset_us[:21],
+        run.plan.target_deg[:21],
+        0.5,
+    )
     assert len(chosen.valid) == k and chosen.used_targets == 20
 
 
 def test_no_frames_at_all_are_no_error():
-    chosen = selection.select(np.zeros(0), np.zeros((0, 6), np.uint16), np.zeros(0, bool), np.zeros(0, int),
-                              np.zeros(3, np.int64), np.zeros((3, 2)), 0.5)
+    chosen = selection.select(
+        np.zeros(0),
+        np.zeros((0, 6), np.uint16),
+        np.zeros(0, bool),
+        np.zeros(0, int),
+        np.zeros(3, np.int64),
+        np.zeros((3, 2)),
+        0.5,
+    )
     assert chosen.used_targets == 0 and len(chosen.valid) == 0

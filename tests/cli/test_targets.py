@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Target plans: what they cover, that they can be repeated, that validation is held out."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -12,7 +13,7 @@ def nearest(points, others):
 
 
 @settings(max_examples=60, deadline=None)
-@given(n=st.integers(9, 300), seed=st.integers(0, 2 ** 31))
+@given(n=st.integers(9, 300), seed=st.integers(0, 2**31))
 def test_calibration_stays_inside_its_range_and_returns_to_the_centre(n, seed):
     plan = targets.calibration_plan(n, seed)
     assert plan.target_deg.shape == (n, 2) and len(plan) == n
@@ -22,7 +23,7 @@ def test_calibration_stays_inside_its_range_and_returns_to_the_centre(n, seed):
 
 
 @settings(max_examples=60, deadline=None)
-@given(n=st.integers(1, 100), seed=st.integers(0, 2 ** 31))
+@given(n=st.integers(1, 100), seed=st.integers(0, 2**31))
 def test_validation_stays_inside_20_deg_and_is_held_out(n, seed):
     calibration = targets.calibration_plan(seed=seed).target_deg
     plan = targets.validation_plan(n, seed)
@@ -37,12 +38,14 @@ def test_every_corner_and_every_part_of_the_field_is_calibrated():
     r = targets.CALIBRATION_RANGE_DEG
     assert nearest(np.array([[-r, -r], [-r, r], [r, -r], [r, r]]), plan).max() == 0.0
     grid = np.array([(a, e) for a in np.linspace(-20, 20, 41) for e in np.linspace(-20, 20, 41)])
-    assert nearest(grid, plan).max() < 5.0      # 120 points on 44 x 44 degrees are about 4 degrees apart
+    assert nearest(grid, plan).max() < 5.0  # 120 points on 44 x 44 degrees are about 4 degrees apart
 
 
 def test_validation_targets_are_spread_over_the_field():
     plan = targets.validation_plan().target_deg
-    assert sorted(np.floor((plan[:, 0] + 20) / 8).astype(int) + 5 * np.floor((plan[:, 1] + 20) / 8).astype(int)) == list(range(25))
+    assert sorted(
+        np.floor((plan[:, 0] + 20) / 8).astype(int) + 5 * np.floor((plan[:, 1] + 20) / 8).astype(int)
+    ) == list(range(25))
 
 
 def test_the_same_seed_gives_the_same_plan_and_another_seed_another():
@@ -60,8 +63,8 @@ def test_a_small_screen_shrinks_the_plan_and_keeps_its_shape():
 
 def test_onsets_are_equally_spaced_in_whole_microseconds():
     plan = targets.calibration_plan(10, dwell_s=0.7654321, settle_s=0.3)
-    onsets = plan.onsets_us(10 ** 12)
-    assert onsets.dtype == np.int64 and onsets[0] == 10 ** 12
+    onsets = plan.onsets_us(10**12)
+    assert onsets.dtype == np.int64 and onsets[0] == 10**12
     assert np.abs(np.diff(onsets) - 765432.1).max() <= 1
     assert plan.seconds == pytest.approx(7.654321)
 
