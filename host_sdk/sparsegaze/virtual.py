@@ -34,6 +34,7 @@ BOOTLOADERS = {                 # name: (start address, file, variable that name
     "atmegaboot": (0x7800, "atmega/ATmegaBOOT_168_atmega328.hex", "SPARSEGAZE_ATMEGABOOT"),
 }
 BOOTLOADER_FOLDERS = (
+    SOURCE_TREE / "tools" / "vheadset" / "build",           # Optiboot from Debian's source: its own build does not fit
     "/usr/share/arduino/hardware/arduino/avr/bootloaders",
     "/usr/local/share/arduino/hardware/arduino/avr/bootloaders",
     "~/.arduino15/packages/arduino/hardware/avr",
@@ -172,7 +173,7 @@ def locate_bootloader(name="optiboot", start=None):
         return address, Path(named)
     for folder in BOOTLOADER_FOLDERS:
         base = Path(folder).expanduser()
-        for path in [base / relative] + sorted(base.glob(f"*/bootloaders/{relative}")):
+        for path in [base / relative, base / Path(relative).name] + sorted(base.glob(f"*/bootloaders/{relative}")):
             if path.is_file():
                 return address, path
     raise VirtualError(f"the stock bootloader {relative} is not installed",

@@ -22,7 +22,7 @@ PHYSICS = FOLDER / "physics.toml"
 SOURCES = pathlib.Path(__file__).resolve().parent / "firmware"
 BUILD = REPO / "build" / "nano"
 BOOTLOADERS = pathlib.Path("/usr/share/arduino/hardware/arduino/avr/bootloaders")
-OPTIBOOT = FOLDER / "bootloaders" / "optiboot" / "optiboot_atmega328.hex"
+OPTIBOOT = FOLDER / "build" / "optiboot_atmega328.hex"         # from Debian's source, see the Makefile there
 ATMEGABOOT = BOOTLOADERS / "atmega" / "ATmegaBOOT_168_atmega328.hex"
 
 # Everything that draws noise or differs from part to part.
