@@ -121,8 +121,7 @@ def _accuracy_lines(report):
 @screen_options
 @json_option
 def calibrate(port, n_targets, vectors, n_validation, seed, save, distance_mm, width_mm, windowed, as_json):
-    """Show targets, record, fit, upload the model and validate it: the whole calibration of the device at
-    PORT.
+    """Show targets, record, fit, upload the model and validate it: the whole calibration of a device.
 
     Look at each dot until it moves; blink while it moves. A simulated person does so by itself. Targets cover
     +-22 deg (or what the screen allows). The recording is kept whatever happens later, so nothing has to be

@@ -48,9 +48,7 @@ class Console:
 
     @contextlib.contextmanager
     def progress(self):
-        """Yields a callback (stage, done, total): a bar on a terminal, a line per quarter elsewhere, all on
-        stderr.
-        """
+        """Yields a callback (stage, done, total): a bar on a terminal, else a line per quarter; on stderr."""
         if sys.stderr.isatty():
             with self._bar() as step:
                 yield step

@@ -51,9 +51,7 @@ class GazeCsv:
         self.flush()
 
     def add(self, frame):
-        """Append a device.Frame; one without raw data has nan features and is not replayed, so it is left
-        out.
-        """
+        """Append a device.Frame; one without raw data could not be replayed and is left out."""
         raw, gaze = frame.raw, frame.gaze
         if raw is None:
             return

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One look at a known point puts right what a shifted headset put wrong: an offset, without a new
-calibration.
-"""
+"""One look at a known point puts right what a shifted headset put wrong: no new calibration."""
 
 from typing import NamedTuple
 

@@ -121,9 +121,7 @@ def run(path, model):
 
 
 def write(done, path):
-    """Write a Replay as CSV: t_us, azimuth_deg, elevation_deg (nan where not valid), flags. Raises
-    RecordingError.
-    """
+    """Write a Replay as CSV: t_us, azimuth_deg, elevation_deg (nan where not valid), flags."""
     part = f"{path}.part"
     try:
         with open(part, "w", encoding="utf-8", newline="\n") as file:

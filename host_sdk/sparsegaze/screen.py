@@ -12,9 +12,7 @@ from .errors import CalibrationError
 
 
 def to_millimetres(target_deg, distance_mm):
-    """Fick (azimuth, elevation) in degrees -> (right, up) in mm on a flat screen at distance_mm, seen from
-    its centre.
-    """
+    """Fick (azimuth, elevation) in degrees -> (right, up) in mm from the centre of a flat screen."""
     azimuth, elevation = (math.radians(v) for v in target_deg)
     return distance_mm * math.tan(azimuth), distance_mm * math.tan(elevation) / math.cos(azimuth)
 
@@ -57,8 +55,7 @@ class Display:
 
 
 class VirtualScreen:
-    """Targets scheduled on a virtual Nano: the simulated person follows them, exact to the device
-    microsecond.
+    """Targets scheduled on a virtual Nano: the simulated person follows them, to the microsecond.
 
     control  VirtualControl of the running virtual Nano
     """
@@ -71,9 +68,7 @@ class VirtualScreen:
         self._onsets = []
 
     def open(self, device):
-        """Learn how device time and the virtual Nano's time relate, by pings between two looks at its
-        clock.
-        """
+        """Learn how device time and the virtual Nano's time relate, by pings between looks at its clock."""
         low, high = None, None
         for _ in range(5):
             before = self.control.time().us
@@ -220,8 +215,6 @@ class WindowScreen:
 
 
 def screen_for(device, **window):
-    """The screen that belongs to an open device: its simulated person's, or a window (arguments of
-    WindowScreen).
-    """
+    """The screen that belongs to an open device: its simulated person's, or a WindowScreen(**window)."""
     control = device.link.control
     return WindowScreen(**window) if control is None else VirtualScreen(control)

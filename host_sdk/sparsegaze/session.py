@@ -21,9 +21,7 @@ FRAME_TIMEOUT_S = 2.0
 
 
 class FrameLog:
-    """Frames as they arrive; arrays on request. Frames without a raw part are counted in `torn` and left
-    out.
-    """
+    """Frames as they arrive; arrays on request. Frames without a raw part only count in `torn`."""
 
     def __init__(self):
         self._rows = []

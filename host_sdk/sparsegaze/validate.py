@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good is the gaze that the device computes: held-out targets, per-frame error, precision, loss, bit
-identity.
+"""How good is the gaze that the device computes: held-out targets, error, precision, loss, bit identity.
 
 Definitions. A frame is *settled* from settle_s after its target's onset to the next onset. Settled frames
 whose gaze has SG_FLAG_VALID count for the error; all other settled frames (blinks, out of range, saturated,
@@ -43,14 +42,11 @@ class Validation:
 
     @property
     def bit_identical(self):
-        """True when every gaze frame equals what the host core computes from its raw frame (and there is
-        one).
-        """
+        """True when every gaze frame equals what the host core computes from its raw frame."""
         return self.compared > 0 and self.differing == 0
 
     def error_of(self, gaze_deg, against_deg=None):
-        """metrics.FrameError of any gaze [n, 2] over the counted frames; against_deg [n, 2], default the
-        targets.
+        """metrics.FrameError of any gaze [n, 2] over the counted frames; against_deg [n, 2] or the targets.
 
         For example the float64 process on the same samples: error_of(gp.predict(run.frames["features"])).
         """
@@ -229,9 +225,7 @@ def read_truth(path, virtual_us):
 
 
 def picture(validation, path, title="held-out targets"):
-    """Draw gaze against targets and the histogram of the error into a PNG file. Needs matplotlib (extra
-    `pictures`).
-    """
+    """Draw gaze against targets and the histogram of the error into a PNG file. Needs the extra `pictures`."""
     from .errors import SparsegazeError
 
     try:

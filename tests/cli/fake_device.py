@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stand-in for an open Device and the person in front of it: linear optics, exact, in device time,
-instantly.
+"""A stand-in for an open Device and the person in front of it: linear optics, exact, instant.
 
 For what a run of targets does with its frames. The real chain is tested on the virtual Nano.
 """
@@ -25,9 +24,7 @@ Pong = namedtuple("Pong", "rx_us tx_us")
 
 
 def linear_model(generation=1, inverse=None, n_vectors=64):
-    """The DeviceModel of gaze = inverse (feature - MIDDLE); inverse [2, 6] deg per step, default that of
-    OPTICS.
-    """
+    """The DeviceModel of gaze = inverse (feature - MIDDLE); inverse [2, 6] deg per step, default: of OPTICS."""
     # s = (feature - offset) / 2
     inverse = np.linalg.pinv(OPTICS) if inverse is None else inverse
     unit = 2.0**-24

@@ -18,9 +18,7 @@ def centre_of(target_deg):
 
 
 class Recorded:
-    """A run of synthetic fixations: noise, slow drift of the eye, and whatever `spoil` does to the eye or
-    features.
-    """
+    """A run of synthetic fixations: noise, slow drift of the eye, and what `spoil` does to the eye."""
 
     def __init__(self, plan=None, seed=0, noise=15.0, spoil=None):
         rng = np.random.default_rng(seed)
