@@ -225,7 +225,7 @@ def read_truth(path, virtual_us):
 
 
 def picture(validation, path, title="held-out targets"):
-    """Draw gaze against targets and the histogram of the error into a PNG file. Needs the extra `pictures`."""
+    """Draw gaze against targets and the histogram of the error as PNG. Needs the extra `pictures`."""
     from .errors import SparsegazeError
 
     try:

@@ -24,7 +24,7 @@ Pong = namedtuple("Pong", "rx_us tx_us")
 
 
 def linear_model(generation=1, inverse=None, n_vectors=64):
-    """The DeviceModel of gaze = inverse (feature - MIDDLE); inverse [2, 6] deg per step, default: of OPTICS."""
+    """The DeviceModel of gaze = inverse (feature - MIDDLE) (default: of OPTICS), [2, 6] deg per step."""
     # s = (feature - offset) / 2
     inverse = np.linalg.pinv(OPTICS) if inverse is None else inverse
     unit = 2.0**-24

@@ -144,7 +144,7 @@ def test_without_pygame_the_remedy_is_the_extra(monkeypatch):
 
 
 class Control:
-    """A virtual Nano's control socket whose clock runs `ahead` us behind device time; each look takes 300 us."""
+    """A virtual Nano's control socket whose clock runs `ahead` us behind device time; a look takes 300 us."""
 
     def __init__(self, ahead):
         self.us, self.ahead, self.log = 50_000_000.0, ahead, []
