@@ -28,8 +28,8 @@ TAIL = 5e-4                 # quantile taken for the end of the calibrated range
 KERNEL_ERROR = 3.0          # of a device kernel value, Q0.16 steps
 CELL, CELLS_MAX = 0.2, 20_000    # length scales; see reach()
 RIDGES = [1e-8 * 3 ** i for i in range(12)]     # of the mean squared kernel value; the first that fits is taken
-POINTS = 3000
-NEIGHBOURS, MIXED, BEYOND = 8, 0.7, 0.7
+POINTS = 6000
+NEIGHBOURS, MIXED, BEYOND = 8, 0.7, 0.5
 ROUNDING = (0.5, 0.75, 0.9, 1.0)
 MEAN = "constant"
 FRAMES_EACH = 16            # frames of each fixation that the process is given, noise and all
@@ -37,7 +37,7 @@ LENGTH_MAX = 3.0            # standard deviations of a channel: longer ones do n
 ROWS_MAX, LEARN_MAX = 2000, 400     # rows of the final process, and of the one whose likelihood is maximised
 CLOUD_EACH = 50
 OUTLIER_SIGMAS, OUTLIER_ROUNDS = 6.0, 3
-FIRST_STEPS, LATER_STEPS = 500, 60
+FIRST_STEPS, LATER_STEPS = 1500, 60
 
 
 @dataclass(frozen=True)
