@@ -76,71 +76,79 @@ double sim_fresnel(double index, double cos_in) {
     return (s * s + p * p) / 2;
 }
 
+// Fermat's length over the cornea's (x, y), with all that its stationary point is judged by.
+struct path {
+    double q[3], u[3], v[3];  // crossing; unit vectors to it from the site and from the spot
+    double s1, s2, zx, zy;    // lengths of both legs; slopes of the cornea
+    double length, gx, gy, hxx, hxy, hyy;
+};
+
+static void measure_path(const struct sim_eye *eye, const double site[3], const double spot[3], double x,
+                         double y, struct path *path) {
+    double r2 = x * x + y * y, root = sqrt(eye->radius * eye->radius - eye->p * r2), n = eye->index;
+    double cube = eye->p / (root * root * root);
+    path->q[0] = x;
+    path->q[1] = y;
+    path->q[2] = eye->apex - r2 / (eye->radius + root);
+    for (int k = 0; k < 3; ++k) {
+        path->u[k] = path->q[k] - site[k];
+        path->v[k] = path->q[k] - spot[k];
+    }
+    path->s1 = sqrt(sim_dot(path->u, path->u));
+    path->s2 = sqrt(sim_dot(path->v, path->v));
+    for (int k = 0; k < 3; ++k) {
+        path->u[k] /= path->s1;
+        path->v[k] /= path->s2;
+    }
+    double zx = path->zx = -x / root, zy = path->zy = -y / root, k1 = 1 / path->s1, k2 = n / path->s2;
+    double ux = path->u[0] + path->u[2] * zx, uy = path->u[1] + path->u[2] * zy;
+    double vx = path->v[0] + path->v[2] * zx, vy = path->v[1] + path->v[2] * zy;
+    double bend = path->u[2] + n * path->v[2];
+    path->length = path->s1 + n * path->s2;
+    path->gx = ux + n * vx;
+    path->gy = uy + n * vy;
+    path->hxx = (1 + zx * zx) * (k1 + k2) - ux * ux * k1 - vx * vx * k2 - bend * (1 / root + x * x * cube);
+    path->hyy = (1 + zy * zy) * (k1 + k2) - uy * uy * k1 - vy * vy * k2 - bend * (1 / root + y * y * cube);
+    path->hxy = zx * zy * (k1 + k2) - ux * uy * k1 - vx * vy * k2 - bend * x * y * cube;
+}
+
 double sim_eye_refract(const struct sim_eye *eye, const double site[3], const double spot[3],
                        double exit[3]) {
     double n = eye->index, r_max2 = 0.9 * eye->radius * eye->radius / (eye->p > 0.1 ? eye->p : 0.1);
     double toward[3] = {site[0] - spot[0], site[1] - spot[1], site[2] - spot[2]};
     double along = toward[2] > 0.1 ? toward[2] : 0.1, rise = (eye->apex - eye->iris_z) * 0.8 / n;
-    double lateral = sqrt(toward[0] * toward[0] + toward[1] * toward[1]);
-    double shift = rise / (along + lateral);
-    double x = spot[0] + toward[0] * shift, y = spot[1] + toward[1] * shift;
-    double u[3], v[3], s1 = 0, s2 = 0, zx = 0, zy = 0, hxx = 1, hxy = 0, hyy = 1, q[3] = {0, 0, 0};
+    // Far from the axis there is little chamber left above the iris.
+    double free_part = 1 - (spot[0] * spot[0] + spot[1] * spot[1]) / (1.3 * eye->limbus * eye->limbus);
+    double shift = rise * free_part / (along + sqrt(toward[0] * toward[0] + toward[1] * toward[1]));
+    struct path path;
+    measure_path(eye, site, spot, spot[0] + toward[0] * shift, spot[1] + toward[1] * shift, &path);
     int settled = 0;
-    for (int i = 0; i < 30; ++i) {
-        double r2 = x * x + y * y;
-        if (r2 > r_max2) {
-            double back = sqrt(r_max2 / r2);
-            x *= back;
-            y *= back;
-            r2 = r_max2;
+    for (int i = 0; i < 40 && !settled; ++i) {
+        // Newton's step on the Hessian made positive, shortened until the path gets shorter.
+        double middle = (path.hxx + path.hyy) / 2, half = (path.hxx - path.hyy) / 2;
+        double least = middle - sqrt(half * half + path.hxy * path.hxy),
+               lift = least < 0.01 ? 0.01 - least : 0;
+        double hxx = path.hxx + lift, hyy = path.hyy + lift, det = hxx * hyy - path.hxy * path.hxy;
+        double dx = -(hyy * path.gx - path.hxy * path.gy) / det,
+               dy = -(hxx * path.gy - path.hxy * path.gx) / det;
+        double step = sqrt(dx * dx + dy * dy), scale = step > 1 ? 1 / step : 1;
+        settled = step < 1e-7 && lift == 0;
+        struct path next = path;
+        for (int j = 0; j < 12; ++j, scale /= 2) {
+            double x = path.q[0] + scale * dx, y = path.q[1] + scale * dy;
+            if (x * x + y * y > r_max2) continue;
+            measure_path(eye, site, spot, x, y, &next);
+            if (next.length <= path.length + 1e-12) break;
         }
-        double root = sqrt(eye->radius * eye->radius - eye->p * r2), cube = eye->p / (root * root * root);
-        q[0] = x;
-        q[1] = y;
-        q[2] = eye->apex - r2 / (eye->radius + root);
-        zx = -x / root;
-        zy = -y / root;
-        for (int k = 0; k < 3; ++k) {
-            u[k] = q[k] - site[k];
-            v[k] = q[k] - spot[k];
-        }
-        s1 = sqrt(sim_dot(u, u));
-        s2 = sqrt(sim_dot(v, v));
-        for (int k = 0; k < 3; ++k) {
-            u[k] /= s1;
-            v[k] /= s2;
-        }
-        double ux = u[0] + u[2] * zx, uy = u[1] + u[2] * zy, vx = v[0] + v[2] * zx, vy = v[1] + v[2] * zy;
-        double gx = ux + n * vx, gy = uy + n * vy, bend = u[2] + n * v[2];
-        double k1 = 1 / s1, k2 = n / s2;
-        hxx = (1 + zx * zx) * (k1 + k2) - ux * ux * k1 - vx * vx * k2 - bend * (1 / root + x * x * cube);
-        hyy = (1 + zy * zy) * (k1 + k2) - uy * uy * k1 - vy * vy * k2 - bend * (1 / root + y * y * cube);
-        hxy = zx * zy * (k1 + k2) - ux * uy * k1 - vx * vy * k2 - bend * x * y * cube;
-        double det = hxx * hyy - hxy * hxy;
-        if (settled) break;
-        double dx, dy;
-        if (det > 0 && hxx > 0) {
-            dx = -(hyy * gx - hxy * gy) / det;
-            dy = -(hxx * gy - hxy * gx) / det;
-        } else {
-            dx = -gx;
-            dy = -gy;
-        }
-        double step = sqrt(dx * dx + dy * dy);
-        if (step > 2) {
-            dx *= 2 / step;
-            dy *= 2 / step;
-        }
-        x += dx;
-        y += dy;
-        settled = step < 1e-7;
+        path = next;
     }
-    memcpy(exit, q, sizeof q);
+    memcpy(exit, path.q, sizeof path.q);
     if (!settled) return 0;
-    double metric = 1 + zx * zx + zy * zy, det = (hxx * hyy - hxy * hxy) / metric, length = sqrt(metric);
-    double cos_out = -(u[2] - zx * u[0] - zy * u[1]) / length,
-           cos_in = (v[2] - zx * v[0] - zy * v[1]) / length;
-    if (det <= 0 || cos_out <= 0 || cos_in <= 0 || v[2] <= 0) return 0;
-    double spread = n * n * cos_out * cos_in / (s1 * s1 * s2 * s2 * det);
-    return v[2] * (1 - sim_fresnel(n, cos_out)) * spread;
+    double metric = 1 + path.zx * path.zx + path.zy * path.zy, size = sqrt(metric);
+    double det = (path.hxx * path.hyy - path.hxy * path.hxy) / metric;
+    double cos_out = -(path.u[2] - path.zx * path.u[0] - path.zy * path.u[1]) / size;
+    double cos_in = (path.v[2] - path.zx * path.v[0] - path.zy * path.v[1]) / size;
+    if (det <= 0 || cos_out <= 0 || cos_in <= 0 || path.v[2] <= 0) return 0;
+    double spread = n * n * cos_out * cos_in / (path.s1 * path.s1 * path.s2 * path.s2 * det);
+    return path.v[2] * (1 - sim_fresnel(n, cos_out)) * spread;
 }

@@ -101,7 +101,8 @@ static int blocked(RTCScene scene, const double from[3], const double to[3]) {
     return ray.tfar < 0;
 }
 
-// Share of a spot's area that sees a site, of its four quarters: shadows' edges fall between spots less roughly.
+// Share of a spot's area that sees a site, of its four quarters: shadows' edges fall between spots less
+// roughly.
 static float spot_share(RTCScene scene, const struct sim_spot *spot, const double site[3], double step) {
     double toward[3], length = sqrt(sim_dot(spot->area, spot->area)), from[3];
     for (int k = 0; k < 3; ++k) toward[k] = site[k] - spot->position[k];

@@ -475,3 +475,10 @@ double sim_person_profile_mm(const struct sim_person *person, double angle_deg) 
     sim_eye_init(&eye, person);
     return sim_eye_rho(&eye, sin(angle_deg * SIM_RADIANS), cos(angle_deg * SIM_RADIANS), &derivative);
 }
+
+double sim_person_iris_light(const struct sim_person *person, const double site_mm[3],
+                             const double spot_mm[3], double exit_mm[3]) {
+    struct sim_eye eye;
+    sim_eye_init(&eye, person);
+    return sim_eye_refract(&eye, site_mm, spot_mm, exit_mm);
+}

@@ -78,6 +78,12 @@ double sim_person_face_mm(const struct sim_person *person, double x_mm, double y
 
 // The eye's profile: distance from the centre of rotation at an angle from the optical axis.
 double sim_person_profile_mm(const struct sim_person *person, double angle_deg);
+
+// sim_eye_refract() for one person: irradiance of a spot on the iris (eye frame: +z out of the cornea) per
+// intensity of a point source at a site, 1/mm^2; exit receives where the light crosses the cornea. For
+// checks.
+double sim_person_iris_light(const struct sim_person *person, const double site_mm[3],
+                             const double spot_mm[3], double exit_mm[3]);
 // cdef end
 
 #endif

@@ -20,7 +20,9 @@ SOURCES = ("sim_map.c", "sim_eye.c", "sim_lid.c", "sim_face.c", "sim_glint.c", "
 
 
 def cdef_regions():
-    """The text between `// cdef begin` and `// cdef end` of every header: one declaration for both languages."""
+    """The text between `// cdef begin` and `// cdef end` of every header: one declaration for both
+    languages.
+    """
     text = []
     for name in HEADERS:
         with open(os.path.join(SIM_C, name), encoding="utf-8") as file:
@@ -55,7 +57,9 @@ def builder():
 
 
 def build_in_place(verbose=False):
-    """Compile and put the module beside the sources; returns its path. Raises what the compiler's driver raises."""
+    """Compile and put the module beside the sources; returns its path. Raises what the compiler's driver
+    raises.
+    """
     with tempfile.TemporaryDirectory() as scratch:
         made = builder().compile(tmpdir=scratch, verbose=verbose)
         target = os.path.join(HERE, os.path.basename(made))

@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """A headset as data: where its sensors and emitters are, how they look, and how they are wired.
 
-Frame: OpenXR's axes (+x right, +y up, -z forward), millimetres, origin at the centre of rotation of a nominal right eye
+Frame: OpenXR's axes (+x right, +y up, -z forward), millimetres, origin at the centre of rotation of a
+nominal right eye
 (+x is temporal); its corneal apex is near z = -13. A headset file (TOML) has any number of
 
     [[led]]        senses and emits with the same lens     [[sensor]], [[emitter]]    one of the two
 
 each with position_mm = [x, y, z], aim_mm = [x, y, z] (the point it looks at), lens_radius_mm, and
-sensitivity_sigma_deg (sensors) or beam_sigma_deg (emitters; for an led the same unless given): the standard deviation
-of a Gaussian in the tangent of the angle off its axis. Emitters also have current_ma. Other keys (pins, part) are kept.
+sensitivity_sigma_deg (sensors) or beam_sigma_deg (emitters; for an led the same unless given): the standard
+deviation
+of a Gaussian in the tangent of the angle off its axis. Emitters also have current_ma. Other keys (pins,
+part) are kept.
 """
+
 import os
 from dataclasses import dataclass, field
 from typing import Dict, Tuple
@@ -24,7 +28,9 @@ _REMEDY = "see headsets/led2gaze.toml for a complete example"
 
 @dataclass(frozen=True)
 class Port:
-    """One sensor or one emitter. Position and aim (unit vector) in the headset's frame; sigma as in the file."""
+    """One sensor or one emitter. Position and aim (unit vector) in the headset's frame; sigma as in the
+    file.
+    """
 
     position_mm: Tuple[float, float, float]
     aim: Tuple[float, float, float]
@@ -35,7 +41,9 @@ class Port:
 
 @dataclass(frozen=True)
 class Headset:
-    """Sensors and emitters in file order; `wiring` has each entry's other keys (pins, resistor) by entry name."""
+    """Sensors and emitters in file order; `wiring` has each entry's other keys (pins, resistor) by entry
+    name.
+    """
 
     name: str
     sensors: Tuple[Port, ...]
@@ -85,7 +93,9 @@ def _port(entry, where, sigma_key):
 
 
 def load_headset(path):
-    """Read a headset file. Raises SceneError, with the entry and key at fault, when it is not a possible headset."""
+    """Read a headset file. Raises SceneError, with the entry and key at fault, when it is not a possible
+    headset.
+    """
     name, data = os.path.basename(str(path)), read_toml(path)
     sensors, emitters, wiring = [], [], {}
     for kind in ("led", "sensor", "emitter"):
@@ -103,7 +113,8 @@ def load_headset(path):
             }
     if not 1 <= len(sensors) <= 32 or not 1 <= len(emitters) <= 32:
         raise SceneError(
-            "%s: has %d sensors and %d emitters, wants 1..32 of each" % (name, len(sensors), len(emitters)), _REMEDY
+            "%s: has %d sensors and %d emitters, wants 1..32 of each" % (name, len(sensors), len(emitters)),
+            _REMEDY,
         )
     board = data.get("board", {})
     return Headset(str(data.get("name", name)), tuple(sensors), tuple(emitters), dict(board), wiring)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writer of response map files (`.sgmap`). sim_c/sim_map.h states the format, sim_map.c is its only reader."""
+"""Writer of response map files (`.sgmap`). sim_c/sim_map.h states the format, sim_map.c is its only
+reader.
+"""
 
 import os
 import struct
@@ -31,7 +33,8 @@ def write_map(
 ):
     """Write one map, atomically (a temporary file renamed into place).
 
-    Axes are 1-d arrays, strictly increasing; `slip_mm` is three of them (x, y, z). Gaze axes are uniform with 1
+    Axes are 1-d arrays, strictly increasing; `slip_mm` is three of them (x, y, z). Gaze axes are uniform
+    with 1
     or >= 4 nodes.
     smooth   [slip x, slip y, slip z, pupil, lid, elevation, azimuth, sensor, emitter], relative irradiance
     glint    [slip x, slip y, slip z, lid, elevation, azimuth, sensor, emitter]
@@ -87,7 +90,8 @@ def _mean_response(axes, smooth, glint):
 
 
 def synthetic_map(path, sensors=6, emitters=6, seed=0, half_angle_deg=25.0):
-    """A map with no optics behind it, for tests of whatever reads maps: bumps of gaze, pupil and lid plus a ring.
+    """A map with no optics behind it, for tests of whatever reads maps: bumps of gaze, pupil and lid plus a
+    ring.
 
     Returns `path`. Same seed, same file.
     """

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A simulated person: an eye, its lids and face in near infrared (940 nm), and how the headset sits on them.
 
-Fields and units are those of `struct sim_person` in sim_c/sim_eye.h. Right eye, +x temporal. Means and spreads are
-published anatomy (cornea: Navarro's and Orbscan's; kappa: Orbscan; globe, lids and albedos: usual textbook values);
+Fields and units are those of `struct sim_person` in sim_c/sim_eye.h. Right eye, +x temporal. Means and
+spreads are
+published anatomy (cornea: Navarro's and Orbscan's; kappa: Orbscan; globe, lids and albedos: usual textbook
+values);
 the spread of roughness, limbus, face relief and of the headset's seat are assumptions.
 """
+
 from dataclasses import asdict, dataclass, fields
 from typing import Tuple
 
@@ -75,7 +78,8 @@ _SPREAD = {
     "nose_mm": (2.0, 11.0, 21.0),
     "cheek_mm": (1.2, 0.0, 6.0),
 }
-# Larger eyes have flatter, wider corneas and deeper chambers; lighter skin goes with a brighter sclera in this band.
+# Larger eyes have flatter, wider corneas and deeper chambers; lighter skin goes with a brighter sclera in
+# this band.
 _CORRELATED = {
     ("globe_radius_mm", "cornea_radius_mm"): 0.4,
     ("globe_radius_mm", "iris_depth_mm"): 0.45,
@@ -119,7 +123,9 @@ def read_toml(path):
         with open(path, "rb") as file:
             return tomllib.load(file)
     except OSError as error:
-        raise SceneError("%s: %s" % (path, error.strerror or "cannot be read"), "give the path of a TOML file")
+        raise SceneError(
+            "%s: %s" % (path, error.strerror or "cannot be read"), "give the path of a TOML file"
+        )
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SceneError("%s: %s" % (path, error), "correct the file")
 
@@ -128,7 +134,9 @@ def load_person(path):
     """A person file: a [person] table with any of the fields of `Person`; what is not given is nominal."""
     table = read_toml(path).get("person")
     if not isinstance(table, dict):
-        raise SceneError("%s: has no [person] table" % path, "its keys are the fields of sparsegaze.person.Person")
+        raise SceneError(
+            "%s: has no [person] table" % path, "its keys are the fields of sparsegaze.person.Person"
+        )
     known = {f.name for f in fields(Person)}
     values = {}
     for key, value in table.items():

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A headset on a person, evaluated directly by sim_c: no grid, no interpolation. See sim_c/sim_scene.h."""
+
 from dataclasses import fields
 
 import numpy as np
@@ -15,7 +16,9 @@ def simulator():
     try:
         from . import _sim
     except ImportError as error:
-        raise SceneError("the simulator is not built (%s)" % error, "python host_sdk/sparsegaze/_sim_build.py")
+        raise SceneError(
+            "the simulator is not built (%s)" % error, "python host_sdk/sparsegaze/_sim_build.py"
+        )
     return _sim.ffi, _sim.lib
 
 
@@ -39,7 +42,8 @@ class Scene:
     """One headset on one person at one slip.
 
     quality   {field of struct sim_quality: value} to integrate finer or coarser than the default
-    Raises SceneError when the scene is impossible (a sensor in the eye or behind the face, a number that is not finite).
+    Raises SceneError when the scene is impossible (a sensor in the eye or behind the face, a number that is
+    not finite).
     Methods may be called from several threads at once.
     """
 
@@ -62,16 +66,21 @@ class Scene:
             200,
         )
         if made == ffi.NULL:
-            raise SceneError("impossible scene: " + ffi.string(error).decode(), "correct the headset or the person")
+            raise SceneError(
+                "impossible scene: " + ffi.string(error).decode(), "correct the headset or the person"
+            )
         self._scene = ffi.gc(made, lib.sim_scene_close)
         self.shape = (len(headset.sensors), len(headset.emitters))
 
     def smooth(self, azimuth_deg, elevation_deg, pupil_mm, lid_opening, terms="smooth"):
-        """The slowly varying terms (face, sclera, iris, or all: smooth) at one gaze: [pupil, lid, sensor, emitter].
+        """The slowly varying terms (face, sclera, iris, or all: smooth) at one gaze: [pupil, lid, sensor,
+        emitter].
 
         pupil_mm ascending, lid_opening in 0..1; both may be scalars (then their axis has length 1).
         """
-        pupils, lids = np.atleast_1d(np.asarray(pupil_mm, float)), np.atleast_1d(np.asarray(lid_opening, float))
+        pupils, lids = np.atleast_1d(np.asarray(pupil_mm, float)), np.atleast_1d(
+            np.asarray(lid_opening, float)
+        )
         out = np.empty((len(pupils), len(lids)) + self.shape)
         bad = self._lib.sim_scene_smooth(
             self._scene,
@@ -85,7 +94,9 @@ class Scene:
             self._ffi.from_buffer("double[]", out),
         )
         if bad:
-            raise SceneError("no such state: gaze %g, %g" % (azimuth_deg, elevation_deg), "gaze within 60 degrees")
+            raise SceneError(
+                "no such state: gaze %g, %g" % (azimuth_deg, elevation_deg), "gaze within 60 degrees"
+            )
         return out
 
     def glint(self, azimuth_deg, elevation_deg, lid_opening):
@@ -101,7 +112,9 @@ class Scene:
             self._ffi.from_buffer("double[]", out),
         )
         if bad:
-            raise SceneError("no such state: gaze %g, %g" % (azimuth_deg, elevation_deg), "gaze within 60 degrees")
+            raise SceneError(
+                "no such state: gaze %g, %g" % (azimuth_deg, elevation_deg), "gaze within 60 degrees"
+            )
         return out
 
     def response(self, azimuth_deg, elevation_deg, pupil_mm=3.5, lid_opening=1.0):

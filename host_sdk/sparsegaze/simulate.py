@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Response maps: what every sensor of a headset collects from every emitter, over gaze, pupil and lids of one person.
+"""Response maps: what every sensor of a headset collects from every emitter, over gaze, pupil and lids of
+one person.
 
-A map is tabulated once (`response_map`, kept in a cache by the hash of everything it depends on) and then evaluated at any
-state (`ResponseMap`, `evaluate`), smoothly between its nodes. Interpolation errors, divided by the mean response of a pair,
+A map is tabulated once (`response_map`, kept in a cache by the hash of everything it depends on) and then
+evaluated at any
+state (`ResponseMap`, `evaluate`), smoothly between its nodes. Interpolation errors, divided by the mean
+response of a pair,
 are measured by tests/sim/test_accuracy.py against `scene.Scene`, which evaluates directly.
 """
+
 import hashlib
 import os
 import threading
@@ -18,17 +22,25 @@ from .mapfile import write_map
 from .person import Person, draw_person, load_person
 from .scene import Scene, simulator
 
-# Gaze goes beyond the +-20 degrees of the targets: saccades overshoot and blinks drag the eye. The pupil's and lids' nodes
+# Gaze goes beyond the +-20 degrees of the targets: saccades overshoot and blinks drag the eye. The pupil's
+# and lids' nodes
 # are closer where people mostly are.
 HALF_ANGLE_DEG = 25.0
 SMOOTH_GAZE_NODES = 31
 GLINT_GAZE_NODES = 71
-PUPIL_NODES_MM = (2.0, 3.0, 4.0, 5.5, 8.0)
+PUPIL_NODES_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 LID_NODES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 PUPIL_NOMINAL_MM = 3.5
 
-STATE_FIELDS = ("azimuth_deg", "elevation_deg", "pupil_mm", "lid_opening", "slip_x_mm", "slip_y_mm", "slip_z_mm")
-
+STATE_FIELDS = (
+    "azimuth_deg",
+    "elevation_deg",
+    "pupil_mm",
+    "lid_opening",
+    "slip_x_mm",
+    "slip_y_mm",
+    "slip_z_mm",
+)
 
 
 def cache_directory():
@@ -122,8 +134,12 @@ def response_map(headset, person, progress=None, cache=None, grid=None, workers=
 
 def _tabulate(headset, person, grid, progress, workers):
     """Both tables, [slip x, slip y, slip z, (pupil,) lid, elevation, azimuth, sensor, emitter]."""
-    slips = [(i, j, k) for i in range(len(grid.slip_mm[0])) for j in range(len(grid.slip_mm[1]))
-             for k in range(len(grid.slip_mm[2]))]
+    slips = [
+        (i, j, k)
+        for i in range(len(grid.slip_mm[0]))
+        for j in range(len(grid.slip_mm[1]))
+        for k in range(len(grid.slip_mm[2]))
+    ]
     n_slip = tuple(len(axis) for axis in grid.slip_mm)
     pairs = (len(headset.sensors), len(headset.emitters))
     n_smooth, n_glint, n_lid = len(grid.smooth_deg), len(grid.glint_deg), len(grid.lid_opening)
@@ -166,12 +182,15 @@ def _tabulate(headset, person, grid, progress, workers):
 
 
 def _mean_response(grid, smooth, glint):
-    """What sim_map_mean() promises, from the two tables by interpolation of neither: means over their own gaze nodes.
+    """What sim_map_mean() promises, from the two tables by interpolation of neither: means over their own
+    gaze nodes.
 
     The pupil is interpolated between its nodes (quadratic: the area counts).
     """
     slip = tuple(int(np.argmin(np.abs(axis))) for axis in grid.slip_mm)
-    pupil = np.array([np.interp(PUPIL_NOMINAL_MM ** 2, grid.pupil_mm ** 2, row) for row in np.eye(len(grid.pupil_mm))])
+    pupil = np.array(
+        [np.interp(PUPIL_NOMINAL_MM**2, grid.pupil_mm**2, row) for row in np.eye(len(grid.pupil_mm))]
+    )
     opened = np.tensordot(pupil, smooth[slip].astype(float), 1)[-1]
     total = 0.0
     for table, nodes in ((opened, grid.smooth_deg), (glint[slip][-1].astype(float), grid.glint_deg)):
@@ -184,7 +203,9 @@ def _mean_response(grid, smooth, glint):
 
 
 class ResponseMap:
-    """An open map file. `evaluate` may be called from several threads at once; close it, or use it in a `with`."""
+    """An open map file. `evaluate` may be called from several threads at once; close it, or use it in a
+    `with`.
+    """
 
     def __init__(self, path):
         self._ffi, self._lib = simulator()
@@ -210,7 +231,9 @@ class ResponseMap:
         self.close()
 
     def axis(self, number):
-        """Nodes of one axis, numbered as in the file: pupil, lid, slip x y z, elevation, azimuth, then the glint's."""
+        """Nodes of one axis, numbered as in the file: pupil, lid, slip x y z, elevation, azimuth, then the
+        glint's.
+        """
         nodes = self._ffi.new("double **")
         count = self._lib.sim_map_axis(self._map, number, nodes)
         return np.array([nodes[0][i] for i in range(count)])
@@ -228,7 +251,10 @@ class ResponseMap:
         out = np.empty((len(full),) + self.shape)
         buffer = self._ffi.from_buffer("double[]", full)
         bad = self._lib.sim_map_eval_many(
-            self._map, self._ffi.cast("struct sim_state *", buffer), len(full), self._ffi.from_buffer("double[]", out)
+            self._map,
+            self._ffi.cast("struct sim_state *", buffer),
+            len(full),
+            self._ffi.from_buffer("double[]", out),
         )
         if bad:
             raise SceneError("%d states are not finite" % bad, "correct the states")

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures that the simulator's tests share."""
+
 import pytest
 
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scenes that the simulator's tests share."""
+
 import numpy as np
 
 from sparsegaze.headset import Headset, Port
@@ -22,7 +23,9 @@ def six(sigma_deg=10.0, lens_radius_mm=1.5):
     for k in range(6):
         angle = np.radians(180 + 36 * k)
         position = (16 * np.cos(angle), 16 * np.sin(angle), -28.0)
-        ports.append(port(position, (-5 * np.cos(angle), -3 * np.sin(angle), -11.0), sigma_deg, lens_radius_mm))
+        ports.append(
+            port(position, (-5 * np.cos(angle), -3 * np.sin(angle), -11.0), sigma_deg, lens_radius_mm)
+        )
     return Headset("six", tuple(ports), tuple(ports))
 
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scenes as data: what is read, what is drawn, and what is refused with its reason."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -49,30 +50,35 @@ def test_the_default_headset_names_each_leds_pins_once(led2gaze):
 
 
 def test_sensors_and_emitters_may_be_separate(tmp_path):
-    text = LED.replace("[[led]]", "[[sensor]]") + LED.replace("[[led]]", "[[emitter]]").replace(
-        "sensitivity_sigma_deg", "beam_sigma_deg") * 2
+    text = (
+        LED.replace("[[led]]", "[[sensor]]")
+        + LED.replace("[[led]]", "[[emitter]]").replace("sensitivity_sigma_deg", "beam_sigma_deg") * 2
+    )
     headset = load_headset(write(tmp_path, text))
     assert (len(headset.sensors), len(headset.emitters)) == (1, 2)
     assert Scene(headset, Person()).response(0, 0).shape == (1, 2)
 
 
-@pytest.mark.parametrize("text, says", [
-    ("", "0 sensors"),
-    ("led = 3", "[[led]]"),
-    ("[[led]]\n", "position_mm"),
-    ("[[led", "it.toml"),
-    (LED.replace("16.0, 0.0", "16.0"), "position_mm"),
-    (LED.replace("16.0", "nan"), "position_mm"),
-    (LED.replace("16.0", "inf"), "position_mm"),
-    (LED.replace("16.0", "true"), "position_mm"),
-    (LED.replace("16.0", '"16"'), "position_mm"),
-    (LED.replace("[16.0, 0.0, -28.0]", "[0.0, 0.0, -11.0]"), "aim_mm"),
-    (LED.replace("= 10.0", "= 0.0"), "sensitivity_sigma_deg"),
-    (LED.replace("= 10.0", "= nan"), "sensitivity_sigma_deg"),
-    (LED.replace("= 1.5", "= -1.5"), "lens_radius_mm"),
-    (LED.replace("lens_radius_mm = 1.5", ""), "lens_radius_mm"),
-    (LED * 33, "33"),
-])
+@pytest.mark.parametrize(
+    "text, says",
+    [
+        ("", "0 sensors"),
+        ("led = 3", "[[led]]"),
+        ("[[led]]\n", "position_mm"),
+        ("[[led", "it.toml"),
+        (LED.replace("16.0, 0.0", "16.0"), "position_mm"),
+        (LED.replace("16.0", "nan"), "position_mm"),
+        (LED.replace("16.0", "inf"), "position_mm"),
+        (LED.replace("16.0", "true"), "position_mm"),
+        (LED.replace("16.0", '"16"'), "position_mm"),
+        (LED.replace("[16.0, 0.0, -28.0]", "[0.0, 0.0, -11.0]"), "aim_mm"),
+        (LED.replace("= 10.0", "= 0.0"), "sensitivity_sigma_deg"),
+        (LED.replace("= 10.0", "= nan"), "sensitivity_sigma_deg"),
+        (LED.replace("= 1.5", "= -1.5"), "lens_radius_mm"),
+        (LED.replace("lens_radius_mm = 1.5", ""), "lens_radius_mm"),
+        (LED * 33, "33"),
+    ],
+)
 def test_a_malformed_headset_is_refused_naming_the_entry(tmp_path, text, says):
     with pytest.raises(SceneError) as caught:
         load_headset(write(tmp_path, text))
@@ -107,13 +113,26 @@ def test_a_sensor_behind_the_face_only_after_slip_is_refused():
         Scene(headset, Person(), slip_mm=(0, 0, 9))
 
 
-@pytest.mark.parametrize("change", [
-    {"cornea_radius_mm": float("nan")}, {"cornea_radius_mm": 5.0}, {"globe_radius_mm": 5.0},
-    {"cornea_asphericity": 3.0}, {"iris_depth_mm": 1.0}, {"iris_depth_mm": 20.0}, {"albedo_skin": 1.2},
-    {"albedo_iris": -0.1}, {"roughness": 0.0}, {"refractive_index": 1.0}, {"lid_upper_deg": -40.0},
-    {"canthus_deg": 0.0}, {"lid_radius_mm": 11.0}, {"limbus_blend_mm": 0.0},
-    {"eye_position_mm": (0.0, float("inf"), 0.0)},
-])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"cornea_radius_mm": float("nan")},
+        {"cornea_radius_mm": 5.0},
+        {"globe_radius_mm": 5.0},
+        {"cornea_asphericity": 3.0},
+        {"iris_depth_mm": 1.0},
+        {"iris_depth_mm": 20.0},
+        {"albedo_skin": 1.2},
+        {"albedo_iris": -0.1},
+        {"roughness": 0.0},
+        {"refractive_index": 1.0},
+        {"lid_upper_deg": -40.0},
+        {"canthus_deg": 0.0},
+        {"lid_radius_mm": 11.0},
+        {"limbus_blend_mm": 0.0},
+        {"eye_position_mm": (0.0, float("inf"), 0.0)},
+    ],
+)
 def test_an_impossible_person_is_refused(change):
     scene_refusal(port((12, 0, -30)), replace(Person(), **change))
 
@@ -142,10 +161,18 @@ def test_a_seed_that_is_no_seed_is_refused(seed):
 
 def test_people_have_the_published_means_spreads_and_correlations():
     people = [draw_person(seed) for seed in range(800)]
-    column = {name: np.array([getattr(p, name) for p in people])
-              for name in ("cornea_radius_mm", "globe_radius_mm", "kappa_azimuth_deg", "cornea_asphericity")}
-    assert abs(column["cornea_radius_mm"].mean() - 7.8) < 0.03 and abs(column["cornea_radius_mm"].std() - 0.26) < 0.02
-    assert abs(column["kappa_azimuth_deg"].mean() - 5.0) < 0.15 and abs(column["kappa_azimuth_deg"].std() - 1.33) < 0.1
+    column = {
+        name: np.array([getattr(p, name) for p in people])
+        for name in ("cornea_radius_mm", "globe_radius_mm", "kappa_azimuth_deg", "cornea_asphericity")
+    }
+    assert (
+        abs(column["cornea_radius_mm"].mean() - 7.8) < 0.03
+        and abs(column["cornea_radius_mm"].std() - 0.26) < 0.02
+    )
+    assert (
+        abs(column["kappa_azimuth_deg"].mean() - 5.0) < 0.15
+        and abs(column["kappa_azimuth_deg"].std() - 1.33) < 0.1
+    )
     assert np.corrcoef(column["globe_radius_mm"], column["cornea_radius_mm"])[0, 1] > 0.3
     assert abs(np.corrcoef(column["globe_radius_mm"], column["kappa_azimuth_deg"])[0, 1]) < 0.12
 
@@ -161,8 +188,16 @@ def test_a_person_file_gives_what_it_says_and_the_rest_is_nominal(tmp_path):
     assert person == replace(Person(), cornea_radius_mm=8.0, eye_position_mm=(1.0, 0.0, -1.0))
 
 
-@pytest.mark.parametrize("text", ["", "[person]\ncornea = 8\n", "[person]\nbrow_mm = 'high'\n", "[person]\nbrow_mm = nan",
-                                  "[person]\neye_position_mm = [1, 2]"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[person]\ncornea = 8\n",
+        "[person]\nbrow_mm = 'high'\n",
+        "[person]\nbrow_mm = nan",
+        "[person]\neye_position_mm = [1, 2]",
+    ],
+)
 def test_a_malformed_person_file_is_refused(tmp_path, text):
     with pytest.raises(SceneError):
         load_person(write(tmp_path, text))

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map file: what its reader refuses, and how it interpolates."""
+
 import struct
 import zlib
 
@@ -27,7 +28,9 @@ def refusal(tmp_path, data):
 
 
 def patched(data, at, form, *values, checksum=True):
-    """The file with a field replaced and, unless told otherwise, a checksum that fits: only the field is wrong."""
+    """The file with a field replaced and, unless told otherwise, a checksum that fits: only the field is
+    wrong.
+    """
     changed = bytearray(data)
     struct.pack_into("<" + form, changed, at, *values)
     if checksum:
@@ -114,15 +117,26 @@ def polynomial_map(path, function, gaze_nodes=9):
     pupil, lid, slip = np.array([2, 3, 4.5, 6, 8.0]), np.array([0, 0.4, 0.7, 1.0]), np.array([-1, 0, 1.0])
     sx, p, l, el, az = np.meshgrid(slip, pupil, lid, gaze, gaze, indexing="ij")
     smooth = function(az, el, p, l, sx)[:, None, None, ..., None, None]
-    write_map(path, pupil_mm=pupil, lid_opening=lid, slip_mm=(slip, [0], [0]), elevation_deg=gaze, azimuth_deg=gaze,
-              smooth=smooth, glint_lid_opening=[0], glint_elevation_deg=[0], glint_azimuth_deg=[0],
-              glint=np.full((3, 1, 1, 1, 1, 1, 1, 1), 0.25), mean=1.0)
+    write_map(
+        path,
+        pupil_mm=pupil,
+        lid_opening=lid,
+        slip_mm=(slip, [0], [0]),
+        elevation_deg=gaze,
+        azimuth_deg=gaze,
+        smooth=smooth,
+        glint_lid_opening=[0],
+        glint_elevation_deg=[0],
+        glint_azimuth_deg=[0],
+        glint=np.full((3, 1, 1, 1, 1, 1, 1, 1), 0.25),
+        mean=1.0,
+    )
     return ResponseMap(path)
 
 
 def test_cubic_gaze_pupil_and_lid_and_quadratic_slip_are_reproduced(tmp_path):
     def function(az, el, p, l, sx):
-        return 30 + (az ** 3 - el ** 3 + az * el ** 2) / 1e4 + p ** 3 / 50 + l ** 3 * az / 30 + p * l + sx ** 2 * el / 50
+        return 30 + (az**3 - el**3 + az * el**2) / 1e4 + p**3 / 50 + l**3 * az / 30 + p * l + sx**2 * el / 50
 
     rng = np.random.default_rng(0)
     low, high = [-25, -25, 2, 0, -1], [25, 25, 8, 1, 1]
@@ -175,8 +189,16 @@ def test_interpolation_has_no_staircase_even_across_nodes(tmp_path):
 
 def test_the_writer_refuses_what_does_not_fit(tmp_path):
     gaze, axes = np.linspace(-5, 5, 5), {}
-    axes = dict(pupil_mm=[3.5], lid_opening=[1], slip_mm=([0], [0], [0]), elevation_deg=gaze, azimuth_deg=gaze,
-                glint_lid_opening=[1], glint_elevation_deg=[0], glint_azimuth_deg=[0])
+    axes = dict(
+        pupil_mm=[3.5],
+        lid_opening=[1],
+        slip_mm=([0], [0], [0]),
+        elevation_deg=gaze,
+        azimuth_deg=gaze,
+        glint_lid_opening=[1],
+        glint_elevation_deg=[0],
+        glint_azimuth_deg=[0],
+    )
     smooth, glint = np.ones((1, 1, 1, 1, 1, 5, 5, 2, 2)), np.zeros((1, 1, 1, 1, 1, 1, 2, 2))
     path = str(tmp_path / "w.sgmap")
     write_map(path, smooth=smooth, glint=glint, **axes)

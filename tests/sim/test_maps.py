@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tabulated maps against direct evaluation off their nodes, and the cache."""
+
 import os
 
 import numpy as np
@@ -11,17 +12,24 @@ from sparsegaze.person import Person, draw_person
 from sparsegaze.scene import Scene
 from sparsegaze.simulate import LID_NODES, PUPIL_NODES_MM, Grid, ResponseMap, evaluate, map_name, response_map
 
-# The product's steps in gaze (1.67 and 0.71 degrees) and all its pupil nodes, over less gaze and with the lids open.
+# The product's steps in gaze (1.67 and 0.71 degrees) and all its pupil nodes, over less gaze and with the
+# lids open.
 PATCH = dict(half_angle_deg=10.0, smooth_nodes=13, glint_nodes=29, lid_opening=(1.0,))
-TINY = dict(half_angle_deg=5.0, smooth_nodes=4, glint_nodes=4, pupil_mm=(3.5,), lid_opening=(0.0, 1.0),
-            quality={"face_step_mm": 1.0, "lid_alpha": 16, "lid_beta": 16, "iris_phi": 16}.items())
+TINY = dict(
+    half_angle_deg=5.0,
+    smooth_nodes=4,
+    glint_nodes=4,
+    pupil_mm=(3.5,),
+    lid_opening=(0.0, 1.0),
+    quality={"face_step_mm": 1.0, "lid_alpha": 16, "lid_beta": 16, "iris_phi": 16}.items(),
+)
 
 
 def off_grid(path, headset, person, states):
     scene = Scene(headset, person)
     truth = np.array([scene.response(*state) for state in states])[:, OFF_DIAGONAL]
     error = evaluate(path, states)[:, OFF_DIAGONAL] - truth
-    return np.sqrt(np.mean(error ** 2)) / truth.mean(), np.abs(error).max() / truth.mean()
+    return np.sqrt(np.mean(error**2)) / truth.mean(), np.abs(error).max() / truth.mean()
 
 
 @pytest.mark.parametrize("seed", [0, 5])
@@ -46,7 +54,9 @@ def test_during_a_blink_between_lid_nodes_the_error_stays_small(led2gaze, tmp_pa
 
 
 def test_the_mean_is_what_the_header_says(led2gaze, tmp_path):
-    grid = Grid(half_angle_deg=20.0, smooth_nodes=5, glint_nodes=5, pupil_mm=PUPIL_NODES_MM, lid_opening=(1.0,))
+    grid = Grid(
+        half_angle_deg=20.0, smooth_nodes=5, glint_nodes=5, pupil_mm=PUPIL_NODES_MM, lid_opening=(1.0,)
+    )
     path = response_map(led2gaze, Person(), cache=str(tmp_path), grid=grid)
     with ResponseMap(path) as opened:
         gaze = np.linspace(-20, 20, 5)
@@ -77,8 +87,12 @@ def test_the_name_depends_on_headset_person_and_nodes(led2gaze):
     name = map_name(led2gaze, Person(), Grid(**TINY))
     port = replace(led2gaze.sensors[0], sigma_deg=11.0)
     other = replace(led2gaze, sensors=(port,) + led2gaze.sensors[1:])
-    names = {name, map_name(other, Person(), Grid(**TINY)), map_name(led2gaze, Person(), Grid()),
-             map_name(led2gaze, replace(Person(), brow_mm=8.0), Grid(**TINY))}
+    names = {
+        name,
+        map_name(other, Person(), Grid(**TINY)),
+        map_name(led2gaze, Person(), Grid()),
+        map_name(led2gaze, replace(Person(), brow_mm=8.0), Grid(**TINY)),
+    }
     assert len(names) == 4
 
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulator against what is known without it: closed forms, symmetry, energy, and smoothness."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -12,22 +13,33 @@ from sparsegaze.person import Person, draw_person
 from sparsegaze.scene import Scene, c_person, simulator
 
 # Lids out of the way, for what concerns the eye alone.
-WIDE = replace(Person(), lid_upper_deg=58.0, lid_lower_deg=-58.0, canthus_deg=80.0, lid_thickness_mm=0.0,
-               lid_upper_follow=0.0, lid_lower_follow=0.0)
+WIDE = replace(
+    Person(),
+    lid_upper_deg=58.0,
+    lid_lower_deg=-58.0,
+    canthus_deg=80.0,
+    lid_thickness_mm=0.0,
+    lid_upper_follow=0.0,
+    lid_lower_follow=0.0,
+)
 # A corneal sphere on the optical axis, looking where the eye looks.
-SPHERE = replace(WIDE, cornea_asphericity=0.0, kappa_azimuth_deg=0.0, kappa_elevation_deg=0.0, limbus_blend_mm=0.3)
+SPHERE = replace(
+    WIDE, cornea_asphericity=0.0, kappa_azimuth_deg=0.0, kappa_elevation_deg=0.0, limbus_blend_mm=0.3
+)
 
 
 def window(port_, point):
     direction = np.subtract(point, port_.position_mm)
     cosine = direction @ np.array(port_.aim) / np.linalg.norm(direction)
-    return np.exp(-(1 / cosine ** 2 - 1) / (2 * np.tan(np.radians(port_.sigma_deg)) ** 2))
+    return np.exp(-(1 / cosine**2 - 1) / (2 * np.tan(np.radians(port_.sigma_deg)) ** 2))
 
 
 def fresnel(index, cosine):
-    inside = np.sqrt(1 - (1 - cosine ** 2) / index ** 2)
-    return (((cosine - index * inside) / (cosine + index * inside)) ** 2
-            + ((inside - index * cosine) / (inside + index * cosine)) ** 2) / 2
+    inside = np.sqrt(1 - (1 - cosine**2) / index**2)
+    return (
+        ((cosine - index * inside) / (cosine + index * inside)) ** 2
+        + ((inside - index * cosine) / (inside + index * cosine)) ** 2
+    ) / 2
 
 
 def sphere_glint(centre, radius, sensor, emitter, index):
@@ -41,7 +53,7 @@ def sphere_glint(centre, radius, sensor, emitter, index):
 
     def point(q):
         flat = np.clip(q, -0.7 * radius, 0.7 * radius)
-        return centre + flat[0] * u + flat[1] * v + np.sqrt(radius ** 2 - flat @ flat) * axis
+        return centre + flat[0] * u + flat[1] * v + np.sqrt(radius**2 - flat @ flat) * axis
 
     def length(q):
         return np.linalg.norm(point(q) - s) + np.linalg.norm(point(q) - e)
@@ -49,19 +61,44 @@ def sphere_glint(centre, radius, sensor, emitter, index):
     q = minimize(length, [0.0, 0.0], method="Nelder-Mead", options={"xatol": 1e-11, "fatol": 1e-15}).x
     h = 1e-3 * radius
     d = np.eye(2) * h
-    second = np.array([[(length(q + d[i] + d[j]) - length(q + d[i] - d[j]) - length(q - d[i] + d[j])
-                         + length(q - d[i] - d[j])) / (4 * h * h) for j in range(2)] for i in range(2)])
+    second = np.array(
+        [
+            [
+                (
+                    length(q + d[i] + d[j])
+                    - length(q + d[i] - d[j])
+                    - length(q - d[i] + d[j])
+                    + length(q - d[i] - d[j])
+                )
+                / (4 * h * h)
+                for j in range(2)
+            ]
+            for i in range(2)
+        ]
+    )
     p = point(q)
     normal = (p - centre) / radius
     determinant = np.linalg.det(second) * (normal @ axis) ** 2
     ds, de = np.linalg.norm(p - s), np.linalg.norm(p - e)
     cosine = normal @ (s - p) / ds
-    return (fresnel(index, cosine) * cosine ** 2 / (ds * ds * de * de * determinant)
-            * window(sensor, p) * window(emitter, p))
+    return (
+        fresnel(index, cosine)
+        * cosine**2
+        / (ds * ds * de * de * determinant)
+        * window(sensor, p)
+        * window(emitter, p)
+    )
 
 
-@pytest.mark.parametrize("sensor_mm, emitter_mm", [((6, -4, -40), (-7, -2, -38)), ((3, 8, -30), (4, -6, -26)),
-                                                   ((12, 0, -60), (2, -9, -200)), ((1, 2, -500), (-9, 3, -33))])
+@pytest.mark.parametrize(
+    "sensor_mm, emitter_mm",
+    [
+        ((6, -4, -40), (-7, -2, -38)),
+        ((3, 8, -30), (4, -6, -26)),
+        ((12, 0, -60), (2, -9, -200)),
+        ((1, 2, -500), (-9, 3, -33)),
+    ],
+)
 def test_glint_of_a_single_sphere_is_the_closed_form_to_second_order_in_roughness(sensor_mm, emitter_mm):
     sensor = port(sensor_mm, sigma_deg=60.0, lens_radius_mm=0.0)
     emitter = port(emitter_mm, sigma_deg=60.0, lens_radius_mm=0.0)
@@ -70,17 +107,29 @@ def test_glint_of_a_single_sphere_is_the_closed_form_to_second_order_in_roughnes
     exact = sphere_glint(centre, SPHERE.cornea_radius_mm, sensor, emitter, SPHERE.refractive_index)
     error = []
     for alpha in (0.04, 0.02, 0.01):
-        scene = Scene(pair(sensor, emitter), replace(SPHERE, roughness=alpha), quality={"glint_theta_deg": 0.05})
+        scene = Scene(
+            pair(sensor, emitter), replace(SPHERE, roughness=alpha), quality={"glint_theta_deg": 0.05}
+        )
         error.append(abs(scene.glint(0, 0, 1.0)[0, 0, 0] / exact - 1))
     assert error[2] < 1e-3
     assert error[0] / error[2] > 10, "quarters with each halving of the roughness"
 
 
 def test_a_very_large_cornea_is_a_flat_mirror():
-    """An eye 100 times the size, 10 mm in front of it: F / (s + d)^2, up to the curvature's s d / (R (s + d))."""
-    grow = {name: 100 * getattr(SPHERE, name) for name in (
-        "cornea_radius_mm", "limbus_radius_mm", "limbus_blend_mm", "limbus_haze_mm", "globe_radius_mm",
-        "iris_depth_mm")}
+    """An eye 100 times the size, 10 mm in front of it: F / (s + d)^2, up to the curvature's s d / (R (s +
+    d)).
+    """
+    grow = {
+        name: 100 * getattr(SPHERE, name)
+        for name in (
+            "cornea_radius_mm",
+            "limbus_radius_mm",
+            "limbus_blend_mm",
+            "limbus_haze_mm",
+            "globe_radius_mm",
+            "iris_depth_mm",
+        )
+    }
     person = replace(SPHERE, roughness=0.01, lid_radius_mm=1205.0, **grow)
     apex = simulator()[1].sim_person_profile_mm(c_person(simulator()[0], person), 0.0)
     sensor, emitter = (port((x, 0.0, -apex - 10.0), (0, 0, -apex), 60.0, 0.0) for x in (-3.0, 3.0))
@@ -90,7 +139,9 @@ def test_a_very_large_cornea_is_a_flat_mirror():
     got = scene.glint(0, 0, 1.0)[0, 0, 0]
     assert got == pytest.approx(flat, rel=0.025)
     centre, radius = np.array([0, 0, 780.0 - apex]), 780.0
-    assert got == pytest.approx(sphere_glint(centre, radius, sensor, emitter, person.refractive_index), rel=0.005)
+    assert got == pytest.approx(
+        sphere_glint(centre, radius, sensor, emitter, person.refractive_index), rel=0.005
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -105,17 +156,19 @@ def test_swapping_sensor_and_emitter_changes_nothing(seed):
 
 
 def test_no_more_light_comes_back_than_was_emitted():
-    """Sensors all over the half space in front, everything white: what they collect against what was sent there."""
+    """Sensors all over the half space in front, everything white: what they collect against what was sent
+    there.
+    """
     white = replace(WIDE, albedo_sclera=1.0, albedo_iris=1.0, albedo_skin=1.0)
     n, far = 200, 500.0
     k = np.arange(n) + 0.5
     cosine, phi = 1 - k / n * (1 - 16 / far), k * 2.39996322972865332
-    sine = np.sqrt(1 - cosine ** 2)
+    sine = np.sqrt(1 - cosine**2)
     places = far * np.stack([sine * np.cos(phi), sine * np.sin(phi), -cosine], 1)
     sensors = tuple(port(tuple(p), (0, 0, 0), 85.0, 0.0) for p in places)
     lamp = port((8.0, -8.0, -30.0), sigma_deg=12.0, lens_radius_mm=0.0)
     scene = Scene(Headset("dome", sensors, (lamp,)), white)
-    collected = scene.response(0, 0)[:, 0].mean() * 2 * np.pi * far ** 2 * (1 - 16 / far)
+    collected = scene.response(0, 0)[:, 0].mean() * 2 * np.pi * far**2 * (1 - 16 / far)
     angle = np.linspace(0, 1.5, 4000)
     beam = np.exp(-np.tan(angle) ** 2 / (2 * np.tan(np.radians(12.0)) ** 2)) * 2 * np.pi * np.sin(angle)
     emitted = beam.sum() * (angle[1] - angle[0])
@@ -125,8 +178,16 @@ def test_no_more_light_comes_back_than_was_emitted():
 @pytest.mark.parametrize("seed", range(3))
 def test_finer_integration_changes_less_than_a_thousandth(seed):
     rng = np.random.default_rng(seed)
-    fine = {"lid_alpha": 200, "lid_beta": 160, "iris_ring": 8, "iris_edge": 40, "iris_phi": 200,
-            "glint_theta_deg": 0.1, "glint_lobe": 0.4, "face_step_mm": 0.15}
+    fine = {
+        "lid_alpha": 200,
+        "lid_beta": 160,
+        "iris_ring": 8,
+        "iris_edge": 40,
+        "iris_phi": 200,
+        "glint_theta_deg": 0.1,
+        "glint_lobe": 0.4,
+        "face_step_mm": 0.15,
+    }
     default, finer = Scene(six(), draw_person(seed)), Scene(six(), draw_person(seed), quality=fine)
     error, mean = [], []
     for _ in range(5):
@@ -155,12 +216,18 @@ def test_no_staircase_in_any_direction(sweep):
     scene = Scene(six(), draw_person(4))
 
     def along(t):
-        state = {"azimuth": (t, 3, 3.5, 1), "elevation": (3, t, 3.5, 1), "pupil": (3, 2, 4 + t / 10, 1),
-                 "lid": (3, 2, 3.5, 0.85 + t / 100)}[sweep]
+        state = {
+            "azimuth": (t, 3, 3.5, 1),
+            "elevation": (3, t, 3.5, 1),
+            "pupil": (3, 2, 4 + t / 10, 1),
+            "lid": (3, 2, 3.5, 0.85 + t / 100),
+        }[sweep]
         return scene.response(*state)[OFF_DIAGONAL]
 
     def roughness(step):
-        values = np.array([along(t) for t in np.arange(-7, 7.01, 0.5)[:, None] + step * np.arange(3) for t in t])
+        values = np.array(
+            [along(t) for t in np.arange(-7, 7.01, 0.5)[:, None] + step * np.arange(3) for t in t]
+        )
         values = values.reshape(-1, 3, values.shape[-1])
         return np.sqrt(np.mean((values[:, 0] - 2 * values[:, 1] + values[:, 2]) ** 2)) / values.mean()
 
