@@ -341,7 +341,7 @@ def recentre(port, clear, distance_mm, width_mm, windowed, as_json):
     with Device(port) as device:
         if clear:
             before = device.recentre()
-            after = device.recentre(clear=True)
+            after = module.keep(device)
             data = {
                 "before_deg": [before.azimuth_deg, before.elevation_deg],
                 "after_deg": [after.azimuth_deg, after.elevation_deg],

@@ -13,6 +13,7 @@ LIMIT_S = 6.0  # in all, for eyes that blink
 LEAST_FRAMES = 60
 SPREAD_LIMIT_DEG = 2.0  # a gaze that wanders more was not resting on the point
 OFFSET_LIMIT_DEG = 30.0
+STORE_S, STORE_LIMIT_S = 0.25, 1.5  # one record in EEPROM takes about 0.2 s
 
 
 class RecentreReport(NamedTuple):
@@ -80,7 +81,7 @@ def run(device, screen, target_deg=(0.0, 0.0), progress=None):
             f"an offset of {np.abs(offset).max():.0f} deg is no headset shift; the old one stays",
             "calibrate again: `sparsegaze calibrate PORT`",
         )
-    after = device.recentre(offset_deg=(float(offset[0]), float(offset[1])))
+    after = keep(device, (float(offset[0]), float(offset[1])))
     return RecentreReport(
         (before.azimuth_deg, before.elevation_deg),
         (after.azimuth_deg, after.elevation_deg),
@@ -88,3 +89,18 @@ def run(device, screen, target_deg=(0.0, 0.0), progress=None):
         float(np.hypot(*correction)),
         len(kept),
     )
+
+
+def keep(device, offset_deg=None):
+    """Set the offset (azimuth, elevation in degrees; None: none) and wait until the device has stored it.
+
+    The device writes its live state byte by byte beside its other work; a reset meanwhile would lose it.
+    Returns the Recentre in force.
+    """
+    written, link = device.status().eeprom_writes, device.link
+    after = device.recentre(offset_deg, clear=offset_deg is None)
+    deadline = link.now() + STORE_LIMIT_S
+    while device.status().eeprom_writes == written and link.now() < deadline:
+        link.sleep(0.02)
+    link.sleep(STORE_S)  # the record counted may have been an earlier one, still under way
+    return after

@@ -119,7 +119,8 @@ class FakeDevice:
         self.unplug_us, self.interrupt_us, self.drop, self.spoil = unplug_us, interrupt_us, set(drop), spoil
         self.rng = np.random.default_rng(seed)
         self.schedule, self.t_us, self.seq = [], 2_000_000, 500
-        self.link = SimpleNamespace(control=None)
+        self.link = SimpleNamespace(control=None, now=lambda: self.t_us * 1e-6, sleep=self._sleep)
+        self.stored_us = None
         self.hello = SimpleNamespace(board_text="fake board", firmware_text="0.0.0")
         self.clock = SimpleNamespace(drift=0.0)
         self.offset_q7 = [0, 0]
@@ -138,6 +139,14 @@ class FakeDevice:
     def set_stream(self, raw=False, gaze=False, counts=False):
         self.stream.append((raw, gaze))
 
+    def _sleep(self, seconds):
+        self.t_us += int(seconds * 1e6)
+
+    def status(self):
+        """The record of a change counts as written 0.2 s after it."""
+        done = self.stored_us is not None and self.t_us >= self.stored_us
+        return SimpleNamespace(eeprom_writes=3 + done)
+
     def model_info(self):
         return SimpleNamespace(active=lib.SG_SLOT_A if self.model else lib.SG_SLOT_NONE)
 
@@ -145,6 +154,8 @@ class FakeDevice:
         return self.model.image
 
     def recentre(self, offset_deg=None, clear=False):
+        if clear or offset_deg is not None:
+            self.stored_us = self.t_us + 200_000
         if clear:
             self.offset_q7 = [0, 0]
         elif offset_deg is not None:

@@ -231,6 +231,12 @@ def test_recentre_takes_the_shift_away_and_adds_to_the_offset_in_force():
     assert again.error_deg < 0.05
 
 
+def test_recentre_returns_only_when_the_device_has_stored_it():
+    device = FakeDevice(linear_model(), shift_deg=(1.0, 0.0))
+    recentre.run(device, device.screen)
+    assert device.stored_us is not None and device.t_us >= device.stored_us
+
+
 def test_recentre_on_another_point_than_the_centre():
     device = FakeDevice(linear_model(), shift_deg=(1.0, 0.0))
     report = recentre.run(device, device.screen, (10.0, 5.0))
