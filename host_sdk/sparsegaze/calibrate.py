@@ -88,9 +88,9 @@ def run(
     from .screen import screen_for
     from .transport import open_link
 
-    _make(folder)
     with open_link(port) as link:
         device = Device(link)
+        _make(folder)
         shown = screen_for(device, **(window or {})) if screen is None else screen
         try:
             plan = targets.calibration_plan(n_targets, seed, reach_deg=shown.reach_deg())

@@ -135,17 +135,23 @@ def calibrate(port, n_targets, vectors, n_validation, seed, save, distance_mm, w
 
     console = Console(as_json)
     folder = save or os.path.join("calibrations", time.strftime("%Y%m%d-%H%M%S"))
-    with console.progress() as progress:
-        done = module.run(
-            port,
-            n_targets,
-            vectors,
-            seed,
-            n_validation,
-            folder,
-            window=_window(distance_mm, width_mm, windowed),
-            progress=progress,
-        )
+    try:
+        with console.progress() as progress:
+            done = module.run(
+                port,
+                n_targets,
+                vectors,
+                seed,
+                n_validation,
+                folder,
+                window=_window(distance_mm, width_mm, windowed),
+                progress=progress,
+            )
+    except BaseException as error:
+        kept = os.path.join(folder, module.RECORDING)
+        if os.path.exists(kept) and kept not in getattr(error, "remedy", "") + getattr(error, "message", ""):
+            console.note(f"the recording is kept in {kept}: sparsegaze fit takes it")
+        raise
     report = done.report()
     for note in report["notes"]:
         console.warn(note)

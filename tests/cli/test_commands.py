@@ -27,8 +27,6 @@ def program(*args, **options):
     )
 
 
-
-
 def test_help_loads_neither_numerics_nor_serial_nor_terminal_code():
     done = program("--help", env={**os.environ, "PYTHONPROFILEIMPORTTIME": "1"})
     assert done.returncode == 0 and "calibrate" in done.stdout
@@ -55,7 +53,6 @@ def test_version(command):
     from sparsegaze import __version__
 
     assert __version__ in command("--version")[1]
-
 
 
 CASES = [
@@ -131,6 +128,11 @@ def test_no_port_leaves_no_recording_behind(command, broken_files):
     assert not (broken_files / "eye.csv").exists()
 
 
+def test_no_port_leaves_no_folder_behind(command, tmp_path):
+    command("calibrate", "/dev/no-such-port", "--save", tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()
+
+
 def test_a_bug_is_one_line_too_and_shows_itself_on_request(command, fake, monkeypatch):
     device = fake(linear_model())
     monkeypatch.setattr(device, "set_stream", lambda **_: 1 / 0)
@@ -145,8 +147,6 @@ def test_a_missing_part_points_to_doctor(command, monkeypatch):
     monkeypatch.setitem(sys.modules, "sparsegaze.virtual", None)
     code, _, err = command("virtual")
     assert code == 1 and "sparsegaze doctor" in err
-
-
 
 
 def test_record_fit_and_replay_from_one_recording(command_json, fake, tmp_path):

@@ -20,6 +20,13 @@ def test_ctrl_c_in_a_recording_exits_130_and_leaves_a_complete_file(command_json
     assert device.screen.closed and device.stream[-1] == "closed"
 
 
+def test_ctrl_c_in_a_calibration_says_where_the_recording_is(command, fake, tmp_path):
+    fake(interrupt_us=9_000_000)
+    code, out, err = command("calibrate", "PORT", "--save", tmp_path / "kept")
+    assert code == 130 and out == "" and str(tmp_path / "kept" / "recording.csv") in err
+    assert Recording.read(tmp_path / "kept" / "recording.csv").valid.sum() > 500
+
+
 def test_ctrl_c_ends_a_stream_with_its_summary_and_exits_130(command_json, fake, tmp_path):
     fake(linear_model(), interrupt_us=4_000_000)
     code, data, _ = command_json("stream", "PORT", "--csv", tmp_path / "gaze.csv")

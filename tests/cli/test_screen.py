@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Screens: geometry of a real display, a window under SDL's dummy driver, the simulated person's clock.
-"""
+"""Screens: geometry of a real display, a window under SDL's dummy driver, the simulated person's clock."""
 
 import math
 from types import SimpleNamespace
