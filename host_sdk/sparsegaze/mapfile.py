@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writer of response map files (`.sgmap`). sim_c/sim_map.h states the format, sim_map.c is its only
-reader.
-"""
+"""Writer of response map files (`.sgmap`): sim_c/sim_map.h states the format, sim_map.c reads it."""
 
 import os
 import struct
@@ -34,8 +32,7 @@ def write_map(
     """Write one map, atomically (a temporary file renamed into place).
 
     Axes are 1-d arrays, strictly increasing; `slip_mm` is three of them (x, y, z). Gaze axes are uniform
-    with 1
-    or >= 4 nodes.
+    with 1 or >= 4 nodes.
     smooth   [slip x, slip y, slip z, pupil, lid, elevation, azimuth, sensor, emitter], relative irradiance
     glint    [slip x, slip y, slip z, lid, elevation, azimuth, sensor, emitter]
     mean     what sim_map_mean() returns; None = from the nodes nearest to pupil 3.5 mm, lids open, no slip.
@@ -90,8 +87,7 @@ def _mean_response(axes, smooth, glint):
 
 
 def synthetic_map(path, sensors=6, emitters=6, seed=0, half_angle_deg=25.0):
-    """A map with no optics behind it, for tests of whatever reads maps: bumps of gaze, pupil and lid plus a
-    ring.
+    """A map with no optics behind it, for tests of whatever reads maps: bumps of the state, and a ring.
 
     Returns `path`. Same seed, same file.
     """

@@ -27,7 +27,7 @@ from .scene import Scene, simulator
 # are closer where people mostly are.
 HALF_ANGLE_DEG = 25.0
 SMOOTH_GAZE_NODES = 31
-GLINT_GAZE_NODES = 71
+GLINT_GAZE_NODES = 61
 PUPIL_NODES_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 LID_NODES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 PUPIL_NOMINAL_MM = 3.5

@@ -12,9 +12,9 @@ from sparsegaze.person import Person, draw_person
 from sparsegaze.scene import Scene
 from sparsegaze.simulate import LID_NODES, PUPIL_NODES_MM, Grid, ResponseMap, evaluate, map_name, response_map
 
-# The product's steps in gaze (1.67 and 0.71 degrees) and all its pupil nodes, over less gaze and with the
+# The product's steps in gaze (1.67 and 0.83 degrees) and all its pupil nodes, over less gaze and with the
 # lids open.
-PATCH = dict(half_angle_deg=10.0, smooth_nodes=13, glint_nodes=29, lid_opening=(1.0,))
+PATCH = dict(half_angle_deg=10.0, smooth_nodes=13, glint_nodes=25, lid_opening=(1.0,))
 TINY = dict(
     half_angle_deg=5.0,
     smooth_nodes=4,
