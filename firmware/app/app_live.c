@@ -4,11 +4,11 @@
 
 enum {
     RECORD_VERSION = 1,
-    // Exposures are stored when they moved by more than an eighth, looked at every 256 frames (0.92 s): 33
-    // looks (30 s) after start, then at most every 652 (10 minutes), which 10^5 EEPROM cycles bear for two
+    // Exposures are stored when they moved by more than an eighth, looked at every 256 frames (0.98 s): 31
+    // looks (30 s) after start, then at most every 610 (10 minutes), which 10^5 EEPROM cycles bear for two
     // years of light that never rests.
-    LOOKS_FIRST = 33,
-    LOOKS_LATER = 652,
+    LOOKS_FIRST = 31,
+    LOOKS_LATER = 610,
 };
 
 struct live_record {

@@ -21,7 +21,7 @@ struct hal_frame {
     uint32_t t_us;                      // mean of the six mid-exposure times, device time
     uint16_t span_us;                   // from t_us to the last sample
     uint16_t seq;                       // low half of the number of frames sensed since boot
-    uint16_t code[HAL_CHANNELS];        // ADC codes, 0..1023
+    uint16_t code_q2[HAL_CHANNELS];     // sums of four ADC codes of the one sample, 0..4092
     uint16_t exposure_cycles[HAL_CHANNELS];   // release to sample, cycles of hal_describe()'s cpu_hz, exact
 };
 

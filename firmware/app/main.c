@@ -57,7 +57,7 @@ static void expose_next(const struct hal_frame *frame)
     for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
         struct sg_expose_led *led = &app.led[i];
         const uint16_t before = led->exposure_cycles;
-        sg_expose_step(led, frame->code[i], frame->exposure_cycles[i]);
+        sg_expose_step(led, frame->code_q2[i], frame->exposure_cycles[i]);
         led->exposure_cycles = app_exposure_limit(led->exposure_cycles);
         exposure[i] = led->exposure_cycles;
         if (before != exposure[i]) {
@@ -72,27 +72,33 @@ static void expose_next(const struct hal_frame *frame)
 static void count_readings(const struct hal_frame *frame)
 {
     for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-        if (frame->code[i] <= SG_EXPOSE_SATURATED_CODE)
+        if (frame->code_q2[i] <= SG_EXPOSE_SATURATED_Q2)
             app_count(&app.saturated);
-        if (frame->code[i] > 1024 - SG_EXPOSE_STARVED_LSB)
+        if (frame->code_q2[i] > 4096 - SG_EXPOSE_STARVED_Q2)
             app_count(&app.starved);
     }
 }
 
-static void stream(const struct hal_frame *frame, const struct sg_raw *raw, const struct sg_gaze *gaze)
+// What is streamed besides the gaze, one after the other in one place: RAM is short.
+union streamed {
+    struct sg_raw raw;
+    struct sg_counts counts;
+};
+
+static void stream(const struct hal_frame *frame, union streamed *out, const struct sg_gaze *gaze)
 {
     // The gaze goes first: it is the one that somebody waits for.
     if (app.stream & SG_STREAM_GAZE)
         send_stream(SG_MSG_GAZE, frame->seq, gaze, sizeof *gaze);
     if (app.stream & SG_STREAM_RAW)
-        send_stream(SG_MSG_RAW, frame->seq, raw, sizeof *raw);
+        send_stream(SG_MSG_RAW, frame->seq, &out->raw, sizeof out->raw);
     if (app.stream & SG_STREAM_COUNTS) {
-        struct sg_counts counts = { .t_us = frame->t_us };
+        out->counts.t_us = frame->t_us;
         for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-            counts.count[i] = frame->code[i];
-            counts.exposure_us_q2[i] = sg_expose_to_us_q2(frame->exposure_cycles[i]);
+            out->counts.count_q2[i] = frame->code_q2[i];
+            out->counts.exposure_us_q2[i] = sg_expose_to_us_q2(frame->exposure_cycles[i]);
         }
-        send_stream(SG_MSG_COUNTS, frame->seq, &counts, sizeof counts);
+        send_stream(SG_MSG_COUNTS, frame->seq, &out->counts, sizeof out->counts);
     }
 }
 
@@ -100,30 +106,31 @@ void app_on_frame(const struct hal_frame *frame)
 {
     const struct sg_model_view *model = app_model();
     const int16_t *recentre = app_recentre();
-    struct sg_raw raw = { .t_us = frame->t_us, .span_us = frame->span_us };
+    union streamed out = { .raw = { .t_us = frame->t_us, .span_us = frame->span_us } };
     struct sg_gaze gaze;
 
     HAL_BEGIN(HAL_SECTION_FEATURE);
-    raw.flags = sg_track_features(frame->code, frame->exposure_cycles, raw.feature);
+    uint8_t flags = sg_track_features(frame->code_q2, frame->exposure_cycles, out.raw.feature);
     HAL_END(HAL_SECTION_FEATURE);
-    raw.flags |= exposures_changed(frame);
+    flags |= exposures_changed(frame);
     if (app_model_slot() == SG_SLOT_RAM)
-        raw.flags |= SG_FLAG_TRIAL;
-    raw.model_crc = model ? model->crc : 0;
-    raw.recentre_az_deg_q7 = recentre[0];
-    raw.recentre_el_deg_q7 = recentre[1];
+        flags |= SG_FLAG_TRIAL;
+    out.raw.flags = flags;
+    out.raw.model_crc = model ? model->crc : 0;
+    out.raw.recentre_az_deg_q7 = recentre[0];
+    out.raw.recentre_el_deg_q7 = recentre[1];
 
     HAL_BEGIN(HAL_SECTION_INFER);
-    sg_track_infer(model, raw.feature, raw.flags, recentre, &gaze);
+    sg_track_infer(model, out.raw.feature, flags, recentre, &gaze);
     HAL_END(HAL_SECTION_INFER);
-    gaze.t_us = raw.t_us;
-    gaze.infer_us = (uint16_t)(hal_now_us() - (raw.t_us + raw.span_us));
+    gaze.t_us = frame->t_us;
+    gaze.infer_us = (uint16_t)(hal_now_us() - (frame->t_us + frame->span_us));
 
     HAL_BEGIN(HAL_SECTION_OUTPUT);
-    stream(frame, &raw, &gaze);
+    stream(frame, &out, &gaze);
     HAL_END(HAL_SECTION_OUTPUT);
 
-    if (raw.flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED))
+    if (flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED))
         count_readings(frame);
     if (app.exposure_auto)
         expose_next(frame);
@@ -140,7 +147,8 @@ void app_describe(struct sg_hello *hello)
     hello->channels = HAL_CHANNELS;
 }
 
-static void start(void)
+// Not inlined: main() would keep its stack for ever.
+__attribute__((noinline)) static void start(void)
 {
     uint16_t exposure[HAL_CHANNELS];
     struct sg_hello hello;

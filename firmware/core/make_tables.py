@@ -16,12 +16,14 @@ JUNCTION_POWER = 0.4
 PIN_PF = 6.0
 SAMPLE_HOLD_PF = 14.0
 SUPPLY_V = 5.0
-CODES = 1024
+CODES_Q2 = 4096           # sum of four readings of 10 bits: quarters of an ADC step
 TIMER_HZ = 16.0e6
 UNIT_A = 62.5e-12         # feature 0
 FEATURE_PER_OCTAVE = 4096
 
-GOAL_FRACTION = 1 / 2.4   # of all charge on the node
+# Of all charge on the node. The sample capacitor joins last and lifts what is nearly empty: 0.64 can be told
+# apart, and a window of WINDOW_RATIO above the goal must fit into it.
+GOAL_FRACTION = 0.30
 WINDOW_RATIO = 2.1        # either way; above the 1.9 that gaze alone moves the light
 
 LICENSE = "// SPDX-License-Identifier: Apache-2.0\n"
@@ -35,14 +37,14 @@ def node_charge_pc(volts):
     return junction + (PIN_PF + SAMPLE_HOLD_PF) * volts
 
 
-def collected_pc(code):
-    """Charge collected when the node ends at an ADC code (may be fractional), pC."""
-    return node_charge_pc(SUPPLY_V) - node_charge_pc(SUPPLY_V * code / CODES)
+def collected_pc(code_q2):
+    """Charge collected when the node ends at a reading in quarters of a code (may be fractional), pC."""
+    return node_charge_pc(SUPPLY_V) - node_charge_pc(SUPPLY_V * code_q2 / CODES_Q2)
 
 
 def code_at(charge_pc):
-    """Code at which a charge has been collected, by bisection; fractional."""
-    low, high = 0.0, float(CODES)
+    """Reading, in quarters of a code, at which a charge has been collected, by bisection; fractional."""
+    low, high = 0.0, float(CODES_Q2)
     for _ in range(60):
         middle = (low + high) / 2
         if collected_pc(middle) > charge_pc:
@@ -83,14 +85,14 @@ def gp_table():
 
 
 def capacitance_log2():
-    """log2 of the mean capacitance over a drop of 16*i codes, with every constant of the feature, Q4.12."""
-    per_code_v = SUPPLY_V / CODES
+    """log2 of the mean capacitance over a drop of 16*i codes (64*i quarters), with every constant of the feature, Q4.12."""
+    per_quarter_v = SUPPLY_V / CODES_Q2
     nodes = []
     for i in range(65):
-        drop = max(16 * i, 1e-6)
-        mean_pf = collected_pc(CODES - drop) / (drop * per_code_v)
-        per_code_c = mean_pf * 1e-12 * per_code_v
-        nodes.append(rounded(FEATURE_PER_OCTAVE * math.log2(per_code_c * TIMER_HZ / UNIT_A)))
+        drop = max(64 * i, 1e-6)
+        mean_pf = collected_pc(CODES_Q2 - drop) / (drop * per_quarter_v)
+        per_quarter_c = mean_pf * 1e-12 * per_quarter_v
+        nodes.append(rounded(FEATURE_PER_OCTAVE * math.log2(per_quarter_c * TIMER_HZ / UNIT_A)))
     return nodes
 
 
@@ -103,12 +105,12 @@ def expose_table():
             '#include <stdint.h>\n\n#include "sg_rom.h"\n\n'
             "// 4096 * log2(1 + i / 64)\n"
             "static const uint16_t log2_mantissa_q12[65] SG_ROM = {\n" + rows(mantissa) + "};\n\n"
-            "// 4096 * log2(mean capacitance over a drop of 16 * i codes), so that the sum is a feature\n"
+            "// 4096 * log2(mean capacitance over a drop of 64 * i quarter codes), so that the sum is a feature\n"
             "static const uint16_t log2_capacitance_q12[65] SG_ROM = {\n" + rows(capacitance_log2()) +
             "};\n\n// The charge to aim at: the feature it would have after 1 cycle. Where the window ends.\n"
             f"#define GOAL_Q12 {goal_feature}L\n"
-            f"#define BRIGHT_CODE {rounded(code_at(goal_pc * WINDOW_RATIO))}U  // goal * {WINDOW_RATIO}\n"
-            f"#define DIM_CODE {rounded(code_at(goal_pc / WINDOW_RATIO))}U  // goal / {WINDOW_RATIO}\n"
+            f"#define BRIGHT_CODE_Q2 {rounded(code_at(goal_pc * WINDOW_RATIO))}U  // goal * {WINDOW_RATIO}\n"
+            f"#define DIM_CODE_Q2 {rounded(code_at(goal_pc / WINDOW_RATIO))}U  // goal / {WINDOW_RATIO}\n"
             "\n#endif\n")
 
 

@@ -27,35 +27,38 @@ static uint16_t log2_q12(uint16_t x)
 }
 
 // log2 of the collected charge, Q4.12, on the scale of GOAL_Q12; minus log2 of the cycles it is the feature.
-static int32_t log2_charge_q12(uint16_t drop)
+static int32_t log2_charge_q12(uint16_t drop_q2)
 {
-    const uint16_t *entry = &log2_capacitance_q12[drop >> 4];
-    // The last node is reached exactly (drop 1024): nothing follows it.
-    const uint16_t capacitance = drop < 1024U ? interpolated_q12(entry, drop & 15U, 4) : sg_rom_word(entry);
-    return (int32_t)capacitance + log2_q12(drop);
+    const uint16_t *entry = &log2_capacitance_q12[drop_q2 >> 6];
+    uint16_t capacitance_q12;
+    if (drop_q2 < 4096U)
+        capacitance_q12 = interpolated_q12(entry, drop_q2 & 63U, 6);
+    else
+        capacitance_q12 = sg_rom_word(entry);   // reached exactly: nothing follows it
+    return (int32_t)capacitance_q12 + log2_q12(drop_q2);
 }
 
-static uint16_t drop_of(uint16_t code)
+static uint16_t drop_of(uint16_t code_q2)
 {
-    return code > 1023U ? 1U : (uint16_t)(1024U - code);
+    return code_q2 > 4092U ? 4U : (uint16_t)(4096U - code_q2);
 }
 
-uint8_t sg_expose_feature(uint16_t code, uint16_t exposure_cycles, uint16_t *feature)
+uint8_t sg_expose_feature(uint16_t code_q2, uint16_t exposure_cycles, uint16_t *feature)
 {
-    const uint16_t drop = drop_of(code);
+    const uint16_t drop_q2 = drop_of(code_q2);
     if (exposure_cycles < 1U)
         exposure_cycles = 1U;
     if (exposure_cycles > 32767U)
         exposure_cycles = 32767U;
-    int32_t value = log2_charge_q12(drop) - log2_q12(exposure_cycles);
+    int32_t value = log2_charge_q12(drop_q2) - log2_q12(exposure_cycles);
     if (value < 0)
         value = 0;
     if (value > UINT16_MAX)
         value = UINT16_MAX;
     *feature = (uint16_t)value;
-    if (code <= SG_EXPOSE_SATURATED_CODE)
+    if (code_q2 <= SG_EXPOSE_SATURATED_Q2)
         return SG_EXPOSE_SATURATED;
-    return drop < SG_EXPOSE_STARVED_LSB ? SG_EXPOSE_STARVED : 0;
+    return drop_q2 < SG_EXPOSE_STARVED_Q2 ? SG_EXPOSE_STARVED : 0;
 }
 
 static uint16_t clipped(uint32_t exposure_cycles)
@@ -97,43 +100,44 @@ static uint16_t stretched(uint16_t exposure_cycles, int32_t octaves_q12)
 }
 
 // The exposure that would have met the goal, from one sample.
-static uint16_t corrected(uint16_t code, uint16_t exposure_cycles)
+static uint16_t corrected(uint16_t code_q2, uint16_t exposure_cycles)
 {
-    if (code <= SG_EXPOSE_SATURATED_CODE)
+    if (code_q2 <= SG_EXPOSE_SATURATED_Q2)
         return clipped(exposure_cycles >> 2);
-    const uint16_t drop = drop_of(code);
-    if (drop < SG_EXPOSE_STARVED_LSB)
+    const uint16_t drop_q2 = drop_of(code_q2);
+    if (drop_q2 < SG_EXPOSE_STARVED_Q2)
         return clipped((uint32_t)exposure_cycles << 2);
-    return stretched(exposure_cycles, GOAL_Q12 - log2_charge_q12(drop));
+    return stretched(exposure_cycles, GOAL_Q12 - log2_charge_q12(drop_q2));
 }
 
 // Has the sample, or the row of samples it belongs to, waited long enough to act?
-static uint8_t lasting(struct sg_expose_led *led, uint16_t code)
+static uint8_t lasting(struct sg_expose_led *led, uint16_t code_q2)
 {
-    if (code <= SG_EXPOSE_SATURATED_CODE)
+    if (code_q2 <= SG_EXPOSE_SATURATED_Q2)
         return 1;
-    if (code < BRIGHT_CODE)
+    if (code_q2 < BRIGHT_CODE_Q2)
         led->streak = (int8_t)(led->streak > 0 ? led->streak + 1 : 1);
-    else if (code > DIM_CODE)
+    else if (code_q2 > DIM_CODE_Q2)
         led->streak = (int8_t)(led->streak < 0 ? led->streak - 1 : -1);
     else
         led->streak = 0;
     return led->streak >= SG_EXPOSE_PATIENCE_BRIGHT || led->streak <= -SG_EXPOSE_PATIENCE_DIM;
 }
 
-uint8_t sg_expose_step(struct sg_expose_led *led, uint16_t code, uint16_t exposure_cycles)
+uint8_t sg_expose_step(struct sg_expose_led *led, uint16_t code_q2, uint16_t exposure_cycles)
 {
-    if (led->tracking && !lasting(led, code))
+    if (led->tracking && !lasting(led, code_q2))
         return 0;
     led->streak = 0;
 
     const uint16_t old = led->exposure_cycles;
-    const uint16_t now = corrected(code, clipped(exposure_cycles));
-    const uint8_t saturated = code <= SG_EXPOSE_SATURATED_CODE;
-    const uint8_t starved = drop_of(code) < SG_EXPOSE_STARVED_LSB;
+    const uint16_t then = clipped(exposure_cycles);
+    const uint16_t now = corrected(code_q2, then);
+    const uint8_t saturated = code_q2 <= SG_EXPOSE_SATURATED_Q2;
+    const uint8_t starved = drop_of(code_q2) < SG_EXPOSE_STARVED_Q2;
     // A saturated or starved sample gives a direction, no measure: it may be older than a better correction.
     if ((saturated && now >= old) || (starved && now <= old)) {
-        if (now == SG_EXPOSE_MIN_CYCLES || now == SG_EXPOSE_MAX_CYCLES)
+        if (now == then)        // taken at the limit itself: there is no better
             led->tracking = 1;
         return 0;
     }

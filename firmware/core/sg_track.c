@@ -11,11 +11,11 @@ _Static_assert((int)SG_GP_OUT_OF_RANGE == (int)SG_FLAG_OUT_OF_RANGE, "flag value
 _Static_assert((int)SG_EXPOSE_SATURATED == (int)SG_FLAG_SATURATED, "flag value");
 _Static_assert((int)SG_EXPOSE_STARVED == (int)SG_FLAG_STARVED, "flag value");
 
-uint8_t sg_track_features(const uint16_t code[6], const uint16_t exposure_cycles[6], uint16_t feature[6])
+uint8_t sg_track_features(const uint16_t code_q2[6], const uint16_t exposure_cycles[6], uint16_t feature[6])
 {
     uint8_t flags = 0;
     for (uint8_t i = 0; i < SG_WIRE_CHANNELS; i++)
-        flags |= sg_expose_feature(code[i], exposure_cycles[i], &feature[i]);
+        flags |= sg_expose_feature(code_q2[i], exposure_cycles[i], &feature[i]);
     return flags;
 }
 

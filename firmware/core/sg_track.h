@@ -12,11 +12,11 @@
 // cdef begin
 // Features of one frame from what the ADC and the timer saw (sg_expose.h).
 //
-//   code              6 ADC codes, 0..1023
+//   code_q2           6 sums of four ADC codes, 0..4092
 //   exposure_cycles   6 exposures as they were, timer cycles, > 0
 //   feature           6 log2 photocurrents, 1/4096 octave
 // Returns SG_FLAG_SATURATED and SG_FLAG_STARVED, or-ed over the channels.
-uint8_t sg_track_features(const uint16_t code[6], const uint16_t exposure_cycles[6], uint16_t feature[6]);
+uint8_t sg_track_features(const uint16_t code_q2[6], const uint16_t exposure_cycles[6], uint16_t feature[6]);
 
 // Gaze of one frame.
 //

@@ -148,7 +148,7 @@ struct sg_raw {
 
 struct sg_counts {
     uint32_t t_us;
-    uint16_t count[6];          // ADC code per channel
+    uint16_t count_q2[6];       // ADC code, 1/4 LSB
     uint16_t exposure_us_q2[6];
 };
 

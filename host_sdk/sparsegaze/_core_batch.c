@@ -14,7 +14,7 @@ int sg_batch_infer(const struct sg_model_view *view, const uint16_t *features, c
                    const int16_t recentre_deg_q7[2], struct sg_gaze *out, size_t n);
 
 // sg_expose_feature over n readings. flags[n] or NULL.
-void sg_batch_feature(const uint16_t *code, const uint16_t *exposure_cycles, uint16_t *feature,
+void sg_batch_feature(const uint16_t *code_q2, const uint16_t *exposure_cycles, uint16_t *feature,
                       uint8_t *flags, size_t n);
 // cdef end
 
@@ -32,11 +32,11 @@ int sg_batch_infer(const struct sg_model_view *view, const uint16_t *features, c
     return worst;
 }
 
-void sg_batch_feature(const uint16_t *code, const uint16_t *exposure_cycles, uint16_t *feature,
+void sg_batch_feature(const uint16_t *code_q2, const uint16_t *exposure_cycles, uint16_t *feature,
                       uint8_t *flags, size_t n)
 {
     for (size_t i = 0; i < n; i++) {
-        const uint8_t seen = sg_expose_feature(code[i], exposure_cycles[i], feature + i);
+        const uint8_t seen = sg_expose_feature(code_q2[i], exposure_cycles[i], feature + i);
         if (flags != NULL)
             flags[i] = seen;
     }

@@ -214,7 +214,7 @@ static void fuzz_expose(void)
     sg_expose_start(&led, (uint16_t)draw(65536));
     for (int i = 0; i < 50; i++) {
         uint16_t feature;
-        const uint16_t code = (uint16_t)draw(draw(2) ? 1024 : 65536), cycles = (uint16_t)draw(65536);
+        const uint16_t code = (uint16_t)draw(draw(2) ? 4096 : 65536), cycles = (uint16_t)draw(65536);
         sg_expose_feature(code, cycles, &feature);
         sg_expose_step(&led, code, draw(2) ? led.exposure_cycles : cycles);
         HOLDS(led.exposure_cycles >= SG_EXPOSE_MIN_CYCLES && led.exposure_cycles <= SG_EXPOSE_MAX_CYCLES,

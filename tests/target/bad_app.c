@@ -3,7 +3,7 @@
 //   HANG_LOOP    from the 100th frame on the main loop stands, the sensing engine runs on
 //   HANG_LIT     the same, with interrupts off at a moment when emitters are lit
 //   BLOCK        interrupts are off for 250 us in every frame, later and later in it
-//   SLOW         5 ms of work for frames that come every 3.6 ms
+//   SLOW         5 ms of work for frames that come every 3.84 ms
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <string.h>

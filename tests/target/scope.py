@@ -9,7 +9,7 @@ from collections import namedtuple
 
 LEDS = 6
 CYCLES_PER_US = 16
-SLOT_US = 600
+SLOT_US = 640
 OFF, EMIT, REVERSE, PULLUP, FLOAT, OPEN = range(6)      # how a LED is driven
 
 # since: cycle of the last event; held: volts on the ADC's sample capacitor
@@ -75,7 +75,7 @@ class Scope:
             between()
             self.run_to(release + int(exposure_us[led] * CYCLES_PER_US), 8)
             sample = self.until(lambda: self.sampled(led, floating))
-            assert self.node(led).drive == FLOAT and [self.node(i).drive for i in others] == [EMIT] * 5
+            assert self.node(led).drive == FLOAT
             dark = self.until(lambda: self.node(witness).since if self.node(witness).drive == OFF else None)
             assert all(self.node(i).drive != EMIT for i in range(LEDS))
             found.append(Slot(led, lit, release, sample, dark))

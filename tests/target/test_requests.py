@@ -33,10 +33,10 @@ def test_hello_says_what_the_board_is(board):
     assert (hello.wire_version, hello.model_version) == (lib.SG_WIRE_VERSION, lib.SG_MODEL_VERSION)
     assert hello.board == lib.SG_BOARD_NANO328P and hello.channels == 6 and hello.cpu_hz == 16_000_000
     assert hello.slot_base == (0x6000, 0x6C00) and hello.slot_bytes == lib.SG_MODEL_SLOT_BYTES
-    assert hello.page_bytes == 128 and hello.frame_period_us == 3600
+    assert hello.page_bytes == 128 and hello.frame_period_us == 3840
     vectors = lib.SG_MODEL_TRIAL_VECTORS_MAX
     assert hello.trial_bytes == lib.SG_MODEL_HEAD_BYTES + vectors * lib.SG_MODEL_RECORD_BYTES
-    assert 0 < hello.exposure_min_us < hello.exposure_max_us <= 280
+    assert 0 < hello.exposure_min_us < hello.exposure_max_us <= 304
 
 
 def test_ping_stamps_arrival_before_answer_in_device_time(board):

@@ -29,7 +29,7 @@ def loaded(device):
     return load
 
 
-@pytest.mark.parametrize("exposure_us", [24, 33.25, 100.5, 280])
+@pytest.mark.parametrize("exposure_us", [16, 33.25, 100.5, 304])
 def test_exposure_is_what_was_asked_for_to_the_cycle_under_load(board, exposure_us):
     """Serial traffic both ways and inference move the release, never the exposure: its jitter is 0 cycles."""
     nano, device = board(models={0: random_model(64).image})
@@ -46,7 +46,7 @@ def test_exposure_is_what_was_asked_for_to_the_cycle_under_load(board, exposure_
 
 def test_each_led_has_its_own_exposure_and_the_device_reports_it_exactly(board):
     nano, device = board()
-    asked = [24, 57.75, 100, 150.25, 222, 280]
+    asked = [16, 57.75, 100, 150.25, 222, 304]
     device.exposure(us=asked)
     device.set_stream(counts=True)
     device.link.sleep(0.01)
@@ -60,7 +60,7 @@ def test_each_led_has_its_own_exposure_and_the_device_reports_it_exactly(board):
 def test_frame_clock_is_steady_and_timestamps_follow_it(board, tmp_path):
     """Slots do not drift: the first release moves by interrupt latency only."""
     nano, device = board(models={0: random_model(64).image})
-    device.exposure(us=[280] * LEDS)
+    device.exposure(us=[304] * LEDS)
     device.set_stream(raw=True, gaze=True)
     device.link.sleep(0.01)
     path = tmp_path / "frames.csv"
@@ -73,17 +73,17 @@ def test_frame_clock_is_steady_and_timestamps_follow_it(board, tmp_path):
     print(f"{len(late)} frames of {FRAME_CYCLES} cycles, first release within {max(late) - min(late)} cycles")
     assert len(late) > 250 and max(late) - min(late) <= JITTER_CYCLES_MAX
     frames = collect(device, 250)[20:]
-    off = [(frame.t_us - frames[0].t_us) - 3600 * (frame.seq - frames[0].seq) for frame in frames]
+    off = [(frame.t_us - frames[0].t_us) - 3840 * (frame.seq - frames[0].seq) for frame in frames]
     assert max(off) - min(off) <= JITTER_CYCLES_MAX / CYCLES_PER_US
-    # Six mid-exposures 600 us apart: the last sample is 2.5 slots and half an exposure after their mean.
-    assert all(abs(frame.raw.span_us - 1640) <= 12 for frame in frames)
+    # Six mid-exposures 640 us apart: the last sample is 2.5 slots and half an exposure after their mean.
+    assert all(abs(frame.raw.span_us - 1752) <= 12 for frame in frames)
     assert device.lost == 0 and device.status().late_slots == 0
 
 
 def test_timestamps_are_the_mean_of_the_mid_exposures(board, tmp_path):
     """Against the cycles at which the LEDs were really released and sampled, over a wrap of the timer."""
     nano, device = board()
-    exposure_us = [24, 280, 50, 200, 100, 150]
+    exposure_us = [16, 304, 50, 200, 100, 150]
     device.exposure(us=exposure_us)
     device.set_stream(raw=True)
     slots = Scope(nano, device.link).slots(13 * LEDS, exposure_us)
@@ -113,14 +113,15 @@ def test_emitters_are_lit_at_most_half_of_any_frame_at_the_longest_exposure(boar
     assert max(lit) <= SLOT_CYCLES // 2 and worst <= FRAME_CYCLES // 2
 
 
-def test_lights_go_out_within_10_us_of_the_sample(board):
+def test_lights_go_out_in_the_cycle_after_the_sample_under_load(board):
+    """All four codes are of one charge: what still fell on the cathode between would be in three of them."""
     nano, device = board(models={0: random_model(64).image})
     device.exposure(us=[150] * LEDS)
     load = loaded(device)
     slots = Scope(nano, device.link).slots(120, [150] * LEDS, load)
     after = [slot.dark - slot.sample for slot in slots]
     print(f"lights out {min(after)}..{max(after)} cycles after the sample")
-    assert 0 < min(after) and max(after) <= 10 * CYCLES_PER_US
+    assert set(after) == {1}
 
 
 @pytest.mark.parametrize("bad", ["HANG_LOOP", "HANG_LIT"])
@@ -140,7 +141,7 @@ def test_a_hang_ends_in_the_dark_within_130_ms_and_is_reported_as_watchdog(
     scope.until(reset_again, 500, 3_000_000)
     resets += 1
     nano.control.frames(frames)
-    link.sleep(0.4)                         # the hundredth frame is at 0.36 s
+    link.sleep(0.42)                        # the hundredth frame is at 0.38 s
     assert not reset_again()
     lit = [node.since for node in map(scope.node, range(LEDS)) if node.drive == EMIT]
     scope.until(reset_again, 100, 200_000)
@@ -196,7 +197,7 @@ def test_frames_that_come_while_the_main_loop_works_are_counted_late(
     before = report(link)
     link.sleep(1.0)
     after = report(link)
-    assert 270 <= after.frames - before.frames <= 285       # sensing does not wait
+    assert 255 <= after.frames - before.frames <= 266       # sensing does not wait
     assert after.late_frames - before.late_frames >= 200 and after.late_slots == before.late_slots
     assert after.reset_cause == before.reset_cause          # slow is not dead
     link.close()

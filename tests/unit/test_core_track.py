@@ -76,7 +76,7 @@ def test_batch_equals_single_frames_and_the_twin():
 
 
 def test_features_of_a_frame_are_those_of_its_channels_with_flags_joined():
-    code, cycles = [500, 32, 1020, 700, 33, 1016], [128, 4480, 1000, 4480, 300, 2000]
+    code, cycles = [2000, 1184, 4080, 2801, 1185, 4064], [256, 4864, 1000, 4864, 300, 2000]
     out, one = ffi.new("uint16_t[6]"), ffi.new("uint16_t *")
     flags = lib.sg_track_features(code, cycles, out)
     joined = 0
@@ -84,4 +84,4 @@ def test_features_of_a_frame_are_those_of_its_channels_with_flags_joined():
         joined |= lib.sg_expose_feature(code[i], cycles[i], one)
         assert one[0] == out[i]
     assert flags == joined == lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED
-    assert lib.sg_track_features([500] * 6, cycles, out) == 0
+    assert lib.sg_track_features([2000] * 6, cycles, out) == 0

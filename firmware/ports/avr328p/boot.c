@@ -15,7 +15,7 @@ enum {
 static uint32_t alive __attribute__((section(".noinit")));
 static uint8_t left_mcusr __attribute__((section(".noinit")));
 static struct {                         // registers as they were found; a reset leaves them alone
-    uint8_t r2, r10, r11, r14, r15;
+    uint8_t r2, r10, r11, r12, r13, r14, r15;
 } left __attribute__((section(".noinit")));
 static uint8_t cause;
 
@@ -29,10 +29,14 @@ void boot_first(void)
     __asm__ volatile("sts %0, r2" "\n\t"
                      "sts %0+1, r10" "\n\t"
                      "sts %0+2, r11" "\n\t"
-                     "sts %0+3, r14" "\n\t"
-                     "sts %0+4, r15" "\n\t"
+                     "sts %0+3, r12" "\n\t"
+                     "sts %0+4, r13" "\n\t"
+                     "sts %0+5, r14" "\n\t"
+                     "sts %0+6, r15" "\n\t"
                      "clr r10" "\n\t"         // seen: they shall not be taken for the bootloader's again
                      "clr r11" "\n\t"
+                     "clr r12" "\n\t"
+                     "clr r13" "\n\t"
                      "clr r14" "\n\t"
                      "clr r15" : : "i"(&left));
     left_mcusr = MCUSR;
@@ -45,11 +49,14 @@ void boot_first(void)
 }
 
 // Optiboot 4 keeps these constants in registers from the moment it begins to listen, which it does after an
-// external reset only. It leaves through its watchdog; a watchdog reset while the application runs finds the
-// application's registers instead.
+// external reset only: in one set of registers as boards carry it, in another when gcc 7 builds its source. It
+// leaves through its watchdog; a watchdog reset while the application runs finds the application's registers
+// instead.
 static uint8_t bootloader_listened(void)
 {
-    return left.r10 == 0x11 && left.r11 == 0x05 && left.r14 == 0x01 && left.r15 == 0x08;
+    return left.r14 == 0x01
+           && ((left.r10 == 0x11 && left.r11 == 0x05 && left.r15 == 0x08)
+               || (left.r12 == 0x11 && left.r13 == 0x05 && left.r15 == 0x03));
 }
 
 // MCUSR says it when the bootloader left it alone; later versions of Optiboot hand it over in r2. Optiboot

@@ -13,11 +13,11 @@
 
 enum port_limits {
     CYCLES_PER_US = 16,
-    SLOT_CYCLES = 600 * CYCLES_PER_US,
-    EXPOSURE_MIN_CYCLES = 24 * CYCLES_PER_US,
+    SLOT_CYCLES = 640 * CYCLES_PER_US,
+    EXPOSURE_MIN_CYCLES = 16 * CYCLES_PER_US,
     // The eye-safety cap. Lit are 5 us of settling, the exposure and the few us until the interrupt after the
-    // sample: below 300 of every 600 us. No command and no caller gets past hal_expose().
-    EXPOSURE_MAX_CYCLES = 280 * CYCLES_PER_US,
+    // sample: below 320 of every 640 us. No command and no caller gets past hal_expose().
+    EXPOSURE_MAX_CYCLES = 304 * CYCLES_PER_US,
     SLOT_A = 0x6000,
     SLOT_B = 0x6C00,
 };

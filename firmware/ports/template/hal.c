@@ -15,9 +15,9 @@ void hal_describe(struct sg_hello *hello)
     hello->slot_base[0] = 0;
     hello->slot_base[1] = 0;
     hello->cpu_hz = 16000000;
-    hello->frame_period_us = 3600;
-    hello->exposure_min_us = 24;
-    hello->exposure_max_us = 280;
+    hello->frame_period_us = 3840;
+    hello->exposure_min_us = 16;
+    hello->exposure_max_us = 304;
     hello->page_bytes = 0;
     hello->board = SG_BOARD_TEMPLATE;
 }
