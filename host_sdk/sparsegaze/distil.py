@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a float64 Gaussian process to the few integer vectors that an 8-bit device can carry.
 
-The device's mean is  bias + trend . s + sum_i w_i k(s, c_i)  (firmware/core/sg_model.h). Everything in it is fitted to
-the process's mean over a cloud of likely inputs: the centres by variable projection and L-BFGS, rounded in stages; then
-trend, weights and bias, one after the other, on the integer kernel values of the device itself, so that the rounding of
-each is made good by those still free. DESIGN.md section 5; notes on what each step buys stand beside it.
+The device's mean is  bias + trend . s + sum_i w_i k(s, c_i)  (firmware/core/sg_model.h). Everything in it is
+fitted to the process's mean over a cloud of likely inputs: the centres by variable projection and L-BFGS,
+rounded in stages; then trend, weights and bias, one after the other, on the integer kernel values of the
+device itself, so that the rounding of each is made good by those still free. DESIGN.md section 5; notes on
+what each step buys stand beside it.
 """
 
 import warnings
@@ -17,24 +18,22 @@ from scipy.optimize import minimize
 from .errors import CalibrationError, ModelError
 from .fixations import TARGETS_NEEDED, fixations
 from .gp import GaussianProcess
-from .model import (CHANNELS, GUARDS_MAX, S_FRAC, S_MAX, U_STEPS, VECTORS_MAX, WEIGHT_FRAC_BITS, DeviceModel, emulate,
-                    kernel_q16, quantise)
+from .model import CHANNELS, GUARDS_MAX, S_FRAC, S_MAX, U_STEPS, VECTORS_MAX, DeviceModel, emulate, quantise
+from .rounding import assemble
 
-BOX_MARGIN = 0.12           # of a channel's calibrated range, on each side
-BOX_SIGMAS = 6.0            # and at least this many frame-noise deviations
-GUARD_MARGIN = 0.12
-GUARD_SIGMAS = 6.0
-TAIL = 5e-4                 # quantile taken for the end of the calibrated range: a stray frame does not widen it
-KERNEL_ERROR = 3.0          # of a device kernel value, Q0.16 steps
-CELL, CELLS_MAX = 0.2, 20_000    # length scales; see reach()
-RIDGES = [1e-8 * 3 ** i for i in range(12)]     # of the mean squared kernel value; the first that fits is taken
+BOX_MARGIN = 0.12  # of a channel's calibrated range, on each side
+BOX_SIGMAS = 6.0  # and at least this many frame-noise deviations
+GUARD_MARGIN = 0.06
+GUARD_SIGMAS = 5.0
+TAIL = 5e-4  # quantile taken for the end of the calibrated range
+RIDGES = [1e-8 * 3**i for i in range(12)]  # of a squared kernel value; the first that fits is taken
 POINTS = 6000
 NEIGHBOURS, MIXED, BEYOND = 8, 0.7, 0.5
 ROUNDING = (0.5, 0.75, 0.9, 1.0)
 MEAN = "constant"
-FRAMES_EACH = 16            # frames of each fixation that the process is given, noise and all
-LENGTH_MAX = 3.0            # standard deviations of a channel: longer ones do not help, and ask for huge weights
-ROWS_MAX, LEARN_MAX = 2000, 400     # rows of the final process, and of the one whose likelihood is maximised
+FRAMES_EACH = 16  # frames of each fixation that the process is given, noise and all
+LENGTH_MAX = 3.0  # standard deviations of a channel: longer ones only ask for huge weights
+ROWS_MAX, LEARN_MAX = 2000, 400  # rows of the final process, and of the one whose likelihood is maximised
 CLOUD_EACH = 50
 OUTLIER_SIGMAS, OUTLIER_ROUNDS = 6.0, 3
 FIRST_STEPS, LATER_STEPS = 1500, 60
@@ -46,9 +45,10 @@ class DistilReport:
 
     rms_deg, max_deg   distance over held-out likely inputs, by the device's integer arithmetic
     out_of_range       share of those inputs that its guards refuse
-    n_vectors, weight_frac_bits, weight_range_deg (least, largest), reach_deg (proven bound of |gaze| before wrapping,
-    and what the accumulator holds), points (used to fit)
+    n_vectors, weight_frac_bits, weight_range_deg (least, largest), reach_deg (proven bound of |gaze| before
+    wrapping, and what the accumulator holds), points (used to fit)
     """
+
     rms_deg: float
     max_deg: float
     out_of_range: float
@@ -59,22 +59,26 @@ class DistilReport:
     points: int
 
 
-def distil(gp, features, gaze_deg, n_vectors=64, seed=0, noise=None, points=POINTS):
+def distil(gp, features, gaze_deg, n_vectors=64, seed=0, noise=None, points=None):
     """Make a DeviceModel from a fitted GaussianProcess.
 
     features    [n, d] frames of the calibration, blinks excluded: their cloud is the range of the model
     gaze_deg    [n, 2] where those frames were looking (used to find neighbours, not as labels)
-    noise       [d] rms of one frame, feature units; default: from neighbours in gaze
-    Returns (DeviceModel, DistilReport); a pure function of its arguments. Raises CalibrationError or ModelError.
+    noise       [d] rms of one frame, feature units; default 0;  points: number of inputs to fit to
+    Returns (DeviceModel, DistilReport); a pure function of its arguments. Raises CalibrationError or
+    ModelError.
     """
     features, gaze = np.asarray(features, float), np.asarray(gaze_deg, float)
+    points = points or POINTS
     if not 1 <= n_vectors <= VECTORS_MAX:
         raise ModelError(f"{n_vectors} vectors do not fit the device", f"ask for 1 to {VECTORS_MAX}")
     if len(features) < 2 or features.shape[1] > CHANNELS:
-        raise CalibrationError(f"{len(features)} samples of {features.shape[1]} channels are too few or too wide",
-                               f"give at least 2 samples of at most {CHANNELS} channels")
+        raise CalibrationError(
+            f"{len(features)} samples of {features.shape[1:]} channels do not do",
+            f"give at least 2 samples of at most {CHANNELS} channels",
+        )
     rng = np.random.default_rng([0x647374, seed])
-    order = np.lexsort(np.column_stack([features, gaze]).T)     # the order of the samples must not matter
+    order = np.lexsort(np.column_stack([features, gaze]).T)  # the order of the samples must not matter
     features, gaze = features[order], gaze[order]
     noise = np.zeros(features.shape[1]) if noise is None else np.asarray(noise, float)
     offset, gain = box(gp, features, noise)
@@ -93,24 +97,34 @@ def distil(gp, features, gaze_deg, n_vectors=64, seed=0, noise=None, points=POIN
         if made:
             break
     else:
-        raise CalibrationError("no number format holds the weights of this model", "calibrate again with more targets")
+        raise CalibrationError(
+            "no number format holds the weights of this model", "calibrate again with more targets"
+        )
     model, bound_deg = made
     fitted = np.clip(np.rint(cloud[held]), 0, 65535).astype(np.uint16)
     az, el, flags = emulate(model, fitted)
     miss = np.hypot(az / 128.0 - target[held, 0], el / 128.0 - target[held, 1])
-    weights = model.weights / 2.0 ** model.weight_frac_bits
+    weights = model.weights / 2.0**model.weight_frac_bits
     return model, DistilReport(
-        float(np.sqrt(np.mean(miss ** 2))), float(miss.max()), float(np.mean(flags & 4 != 0)), model.vectors,
-        model.weight_frac_bits, (float(weights.min()), float(weights.max())), bound_deg, int((~held).sum()))
+        float(np.sqrt(np.mean(miss**2))),
+        float(miss.max()),
+        float(np.mean(flags & 4 != 0)),
+        model.vectors,
+        model.weight_frac_bits,
+        (float(weights.min()), float(weights.max())),
+        bound_deg,
+        int((~held).sum()),
+    )
 
 
 def box(gp, features, noise):
     """Offset and gain of every channel: (offset int64 [d], gain_q12 int64 [d]).
 
-    The box holds the calibrated range and a margin, so that ordinary gaze never clips, and no more than that: the
-    device's length scale is a fixed part of the box, and the shorter it is, the smaller are the weights that a steep
-    direction needs. Gains by the process's length scales gave weights 4 times larger at equal error on simulated eyes,
-    whose channels are alike and differ where it matters. Channels that the process dropped have gain 0.
+    The box holds the calibrated range and a margin, so that ordinary gaze never clips, and no more than that:
+    the device's length scale is a fixed part of the box, and the shorter it is, the smaller are the weights
+    that a steep direction needs. Gains by the process's length scales gave weights 4 times larger at equal
+    error on simulated eyes, whose channels are alike and differ where it matters. Channels that the process
+    dropped have gain 0.
     """
     low, high = np.quantile(features, [TAIL, 1 - TAIL], axis=0)
     margin = np.maximum(BOX_MARGIN * (high - low), BOX_SIGMAS * noise) + 2
@@ -130,8 +144,8 @@ def unquantise(s, offset, gain_q12, like):
 def likely_inputs(rng, features, gaze, noise, count):
     """`count` inputs such as the device will meet: frames and mixtures of neighbours in gaze.
 
-    Neighbours differ by pupil and time as well as by gaze: mixtures reach beyond them, because both will drift on. A
-    mixture has another noise than a frame; what it lacks is added.
+    Neighbours differ by pupil and time as well as by gaze: mixtures reach beyond them, because both will
+    drift on. A mixture has another noise than a frame; what it lacks is added.
     """
     n = len(features)
     anchor = rng.integers(0, n, count)
@@ -143,19 +157,23 @@ def likely_inputs(rng, features, gaze, noise, count):
         near = pool[np.argpartition(distance, min(reach, len(pool) - 1), axis=1)[:, :reach]]
         partner = near[np.arange(len(rows)), rng.integers(0, near.shape[1], len(rows))]
         share = rng.uniform(-BEYOND, 1.0, (len(rows), 1)) * (rng.random((len(rows), 1)) < MIXED)
-        lost = np.sqrt(np.maximum(1 - (1 - share) ** 2 - share ** 2, 0.0))
-        mixed[rows] = ((1 - share) * features[anchor[rows]] + share * features[partner]
-                       + lost * noise * rng.standard_normal((len(rows), features.shape[1])))
+        lost = np.sqrt(np.maximum(1 - (1 - share) ** 2 - share**2, 0.0))
+        mixed[rows] = (
+            (1 - share) * features[anchor[rows]]
+            + share * features[partner]
+            + lost * noise * rng.standard_normal((len(rows), features.shape[1]))
+        )
     return mixed
 
 
 def optimise_centres(rng, s, target, n_vectors, free, ridge, start=None):
-    """Centres [n_vectors, d] in 0..255 for the least squared distance to target [m, 2] at inputs s [m, d] (u8.4).
+    """Centres [n_vectors, d] in 0..255 for the least squares to target [m, 2] at inputs s [m, d] (u8.4).
 
-    Variable projection: for given centres the weights and the trend are a linear least-squares problem, and at its
-    solution the derivative in the centres needs no derivative of the weights (Golub & Pereyra 1973). Bounds keep the
-    centres in the box; in stages the coordinates nearest to integers are frozen there and the rest moves on: rounding
-    all at once at the end costs three times the error. `start` are centres to begin with.
+    Variable projection: for given centres the weights and the trend are a linear least-squares problem, and
+    at its solution the derivative in the centres needs no derivative of the weights (Golub & Pereyra 1973).
+    Bounds keep the centres in the box; in stages the coordinates nearest to integers are frozen there and the
+    rest moves on: rounding all at once at the end costs three times the error. `start` are centres to begin
+    with.
     """
     x = s / S_FRAC / U_STEPS
     linear = np.hstack([np.ones((len(x), 1)), x[:, free] - x[:, free].mean(axis=0)])
@@ -183,11 +201,16 @@ def optimise_centres(rng, s, target, n_vectors, free, ridge, start=None):
             trial = centres.copy()
             trial[moving] = values
             value, slope = _projected(trial, x, linear, y, ridge)
-            return np.log(value), slope[moving] / value     # the scale that L-BFGS's tolerances expect
+            return np.log(value), slope[moving] / value  # the scale that L-BFGS's tolerances expect
 
-        found = minimize(objective, centres[moving], jac=True, method="L-BFGS-B",
-                         bounds=[(0.0, top)] * int(moving.sum()),
-                         options={"maxiter": LATER_STEPS if stage else first, "maxcor": 20, "ftol": 1e-6, "gtol": 1e-6})
+        found = minimize(
+            objective,
+            centres[moving],
+            jac=True,
+            method="L-BFGS-B",
+            bounds=[(0.0, top)] * int(moving.sum()),
+            options={"maxiter": LATER_STEPS if stage else first, "maxcor": 20, "ftol": 1e-6, "gtol": 1e-6},
+        )
         centres[moving] = found.x
     return np.clip(np.rint(centres * U_STEPS), 0, 255).astype(np.int64)
 
@@ -202,8 +225,8 @@ def _projected(centres, x, linear, y, ridge):
     normal[np.diag_indices(len(normal))] += ridge * m
     w = cho_solve(cho_factor(normal, check_finite=False), design.T @ y, check_finite=False)
     residual = design @ w - y
-    value = np.sum(residual ** 2) / m + ridge * np.sum(w ** 2)
-    pull = (residual @ w[:len(centres)].T) * k
+    value = np.sum(residual**2) / m + ridge * np.sum(w**2)
+    pull = (residual @ w[: len(centres)].T) * k
     slope = 2.0 / m * (pull.T @ x - pull.sum(axis=0)[:, None] * centres)
     return value, slope
 
@@ -219,95 +242,11 @@ def maximin(rng, x, count):
     return pool[chosen].copy()
 
 
-def assemble(s, target, centres, offset, gain, rails, ridge):
-    """Trend, weights and bias in the device's integers, on the device's own kernel values.
-
-    Takes the finest weight format whose weights fit 16 bits and whose sum provably fits 32.
-    Returns (DeviceModel, (proven bound of |gaze| in degrees, what the accumulator holds)), or None when none fits.
-    """
-    k = kernel_q16(s, centres) / 65536.0
-    design = np.hstack([k, s / 4096.0, np.ones((len(s), 1))])
-    n, d = len(centres), s.shape[1]
-    normal = design.T @ design
-    for bits in reversed(WEIGHT_FRAC_BITS):
-        damped = normal + np.diag(np.r_[np.full(n, ridge), np.full(d, 1e-9), 0.0]) * len(s)
-        fine = 2.0 ** -(bits + 16)
-        unit = np.r_[np.full(n, 2.0 ** -bits), np.full(d, 4096.0 * fine), fine]
-        whole = _round_in_turn(damped, design.T @ target, unit, np.r_[np.arange(n, n + d), np.arange(n), n + d])
-        weights, trend, bias = whole[:n], whole[n:n + d].T, whole[-1]
-        if np.abs(weights).max() > 32767 or np.abs(whole[n:]).max() >= 2 ** 31:
-            continue
-        bound = reach(weights, trend, bias, centres, rails)
-        if bound < 2 ** 31:
-            model = DeviceModel.from_parts(offset, gain, bias, trend, centres, weights, bits, rails)
-            return model, (float(bound * fine), float(2 ** 31 * fine))
-    return None
-
-
-def _round_in_turn(normal, moment, unit, order):
-    """Least-squares solution whose entries are whole multiples of `unit`: int64, same shape as moment.
-
-    Entries are rounded in the given order; after each, those still free are solved anew given all the rounded ones.
-    """
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    normal = normal * scale[:, None] * scale
-    normal[np.diag_indices(len(normal))] += 1e-14
-    inverse = cho_solve(cho_factor(normal), np.eye(len(normal)))
-    value = inverse @ (moment * scale[:, None])
-    step = unit / scale
-    whole = np.zeros(moment.shape, np.int64)
-    for i in order:
-        whole[i] = np.rint(value[i] / step[i]).astype(np.int64)
-        error = (value[i] - whole[i] * step[i]) / inverse[i, i]
-        value = value - np.outer(inverse[:, i], error)
-        inverse = inverse - np.outer(inverse[:, i], inverse[i]) / inverse[i, i]
-    return whole
-
-
-def reach(weights, trend, bias, centres, rails):
-    """Bound of |bias + trend . s + sum w k| over every input that no guard flags, in accumulator steps.
-
-    The guards' parallelepiped is cut into cells. Within a cell of half widths h around c, with f the sum of kernels and
-    L the length scale,   |value - value(c)| <= |gradient(c) . h| + sqrt(3)/2 |f| |h|^2 / L^2 :   f is a member of the
-    kernel's function space, where |f| = sqrt(w' K w) and every second derivative is at most |f| times the square root
-    of the kernel's fourth, 3 / L^4. Each of the device's kernel values is within KERNEL_ERROR of the exact (sg_gp.h).
-    """
-    live = np.flatnonzero(np.any([row for _, _, row in rails], axis=0))
-    rows = np.array([row[live] for _, _, row in rails], float)
-    low, high = (np.array([rail[i] for rail in rails], float) for i in (0, 1))
-    length = U_STEPS * S_FRAC
-    columns = np.linalg.inv(rows) / length
-    extent = np.linalg.norm(columns, axis=0) * (high - low)
-    cell = CELL
-    while np.prod(np.ceil(extent / cell)) > CELLS_MAX:
-        cell *= 1.1
-    cuts = np.ceil(extent / cell).astype(int)
-    parts = [lo + (np.arange(cut) + 0.5) * (hi - lo) / cut for lo, hi, cut in zip(low, high, cuts)]
-    middle = np.stack([g.ravel() for g in np.meshgrid(*parts, indexing="ij")], axis=1) @ columns.T
-    half = columns * (high - low) / (2 * cuts)
-    size2 = np.abs(half.T @ half).sum()
-    overlap = np.abs(half).sum(axis=1)          # cells outside the box hold no input
-    middle = middle[((middle > -overlap) & (middle < S_MAX / length + overlap)).all(axis=1)]
-    spot = centres[:, live] / U_STEPS
-    gram = np.exp(-0.5 * ((spot[:, None] - spot) ** 2).sum(-1))
-    norm = np.sqrt(np.maximum(np.einsum("io,ij,jo->o", weights.astype(float), gram, weights.astype(float)), 0.0))
-    worst = 0.0
-    for block in np.array_split(middle, max(1, len(middle) // 2000)):
-        k = 65536.0 * np.exp(-0.5 * ((block[:, None] - spot) ** 2).sum(-1))
-        for o in range(2):
-            w, slope = weights[:, o].astype(float), trend[o, live].astype(float) * length
-            value = bias[o] + block @ slope + k @ w
-            gradient = slope + (k * w) @ spot - (k @ w)[:, None] * block
-            spread = np.abs(gradient @ half).sum(axis=1) + 65536.0 * np.sqrt(3.0) / 2 * norm[o] * size2
-            worst = max(worst, np.max(np.abs(value) + spread) + KERNEL_ERROR * np.abs(w).sum())
-    return float(worst * (1.0 + 1e-9))
-
-
 def guards(features, offset, gain, noise):
     """Bounds along the principal directions of the calibrated cloud: list of (low, high, row int8 [d]).
 
-    Blinks and slip leave the cloud in directions in which gaze does not move it, long before a single channel leaves
-    its own range.
+    Blinks and slip leave the cloud in directions in which gaze does not move it, long before a single channel
+    leaves its own range.
     """
     s, _ = quantise(np.clip(np.rint(features), 0, 65535), offset, gain)
     live = np.flatnonzero(gain > 0)
@@ -320,7 +259,8 @@ def guards(features, offset, gain, noise):
         row[live] = np.rint(127.0 * direction / np.abs(direction).max())
         projection = s @ row
         low, high = np.quantile(projection, [TAIL, 1 - TAIL])
-        margin = max(GUARD_MARGIN * (high - low), GUARD_SIGMAS * float(np.sqrt(row[live] ** 2 @ step_noise ** 2)))
+        spread = float(np.sqrt(row[live] ** 2 @ step_noise**2))
+        margin = max(GUARD_MARGIN * (high - low), GUARD_SIGMAS * spread)
         result.append((int(np.floor(low - margin)), int(np.ceil(high + margin)), row))
     return result
 
@@ -328,6 +268,7 @@ def guards(features, offset, gain, noise):
 @dataclass(frozen=True)
 class FitResult:
     """What fit_recording made: gp GaussianProcess, model DeviceModel, report FitReport."""
+
     gp: GaussianProcess
     model: DeviceModel
     report: "FitReport"
@@ -341,6 +282,7 @@ class FitReport:
     loo_rms_deg  leave-one-fixation-out error of the fixations' means; lml, condition, jitter of the process
     length [d] feature units, signal_deg, noise_deg; dropped_channels; distil: DistilReport
     """
+
     fixations: int
     frames: int
     rejected_frames: int
@@ -359,10 +301,11 @@ class FitReport:
 def fit_recording(recording, n_vectors=64, seed=0):
     """Recording -> FitResult. Raises RecordingError or CalibrationError; warns of channels it drops.
 
-    Length scales and noise are learnt from the fixations' means, of which each is one observation. The final process
-    is then given single frames, with that noise each: the device judges single frames, and a process that has only
-    seen means trusts directions that their noise fills. On simulated persons this takes 5 % off the error of frames;
-    likelihood on frames, or noise shared within fixations, makes it worse (frames of a fixation agree for free).
+    Length scales and noise are learnt from the fixations' means, of which each is one observation. The final
+    process is then given single frames, with that noise each: the device judges single frames, and a process
+    that has only seen means trusts directions that their noise fills. On simulated persons this takes 5 % off
+    the error of frames; likelihood on frames, or noise shared within fixations, makes it worse (frames of a
+    fixation agree for free).
     """
     fixed = fixations(recording)
     learnt = _learn(fixed, seed)
@@ -371,11 +314,13 @@ def fit_recording(recording, n_vectors=64, seed=0):
         predicted, spread = learnt.loo()
         miss = np.linalg.norm(learnt.y - predicted, axis=1) / spread
         worst = np.flatnonzero(miss > OUTLIER_SIGMAS)
-        worst = worst[np.argsort(-miss[worst])][:max(1, len(miss) // 20)]
+        worst = worst[np.argsort(-miss[worst])][: max(1, len(miss) // 20)]
         if not len(worst) or len(fixed.mean) - len(worst) < TARGETS_NEEDED:
             break
-        gone = [int(np.flatnonzero((fixed.mean == learnt.x[i]).all(1) & (fixed.target == learnt.y[i]).all(1))[0])
-                for i in worst]
+        gone = [
+            int(np.argmax((fixed.mean == learnt.x[i]).all(1) & (fixed.target == learnt.y[i]).all(1)))
+            for i in worst
+        ]
         lost += [[float(v) for v in fixed.target[i]] for i in gone]
         fixed = fixed.without(gone)
         with warnings.catch_warnings():
@@ -385,41 +330,69 @@ def fit_recording(recording, n_vectors=64, seed=0):
     rows = _thin(fixed.frames(max(1, min(FRAMES_EACH, ROWS_MAX // len(fixed.mean)))), ROWS_MAX)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        gp = GaussianProcess.fit(*spread_out(fixed, rows, seed), hyper=learnt.hyper, mean=MEAN,
-                                 noise_scale=fixed.noise_scale()[fixed.label[rows]])
+        gp = GaussianProcess.fit(
+            *spread_out(fixed, rows, seed),
+            hyper=learnt.hyper,
+            mean=MEAN,
+            noise_scale=fixed.noise_scale()[fixed.label[rows]],
+        )
     cloud = fixed.frames(CLOUD_EACH)
     model, report = distil(gp, fixed.features[cloud], fixed.target_deg[cloud], n_vectors, seed, fixed.noise)
-    return FitResult(gp, model, FitReport(
-        len(fixed.mean), len(fixed.features), fixed.rejected, lost,
-        float(np.sqrt(np.mean(np.sum((learnt.y - predicted) ** 2, axis=1)))), learnt.lml, learnt.condition,
-        learnt.jitter, [float(v) for v in learnt.hyper.length], learnt.hyper.signal_deg, learnt.hyper.noise_deg, learnt.dropped,
-        report))
+    return FitResult(
+        gp,
+        model,
+        FitReport(
+            len(fixed.mean),
+            len(fixed.features),
+            fixed.rejected,
+            lost,
+            float(np.sqrt(np.mean(np.sum((learnt.y - predicted) ** 2, axis=1)))),
+            learnt.lml,
+            learnt.condition,
+            learnt.jitter,
+            [float(v) for v in learnt.hyper.length],
+            learnt.hyper.signal_deg,
+            learnt.hyper.noise_deg,
+            learnt.dropped,
+            report,
+        ),
+    )
 
 
 def spread_out(fixed, rows, seed):
     """Frames `rows` of the Fixations, each moved to a place near its target: (features [n, d], gaze [n, 2]).
 
-    Targets stand some degrees apart, and the features bend between them (the ring of the limbus is 2 degrees wide). The
-    map from gaze to features is smooth and two-dimensional, so that far fewer points tell it than its inverse: frames
-    are moved along it by up to half the distance between targets, noise and pupil included.
+    Targets stand some degrees apart, and the features bend between them (the ring of the limbus is 2 degrees
+    wide). The map from gaze to features is smooth and two-dimensional, so that far fewer points tell it than
+    its inverse: frames are moved along it by up to half the distance between targets, noise and pupil
+    included.
     """
     target, place = fixed.target_deg[rows], fixed.target
+    few = _thin(np.arange(len(place)), LEARN_MAX)
     low, high = place.min(axis=0), place.max(axis=0)
     reach_deg = 0.5 * np.sqrt(np.prod(np.maximum(high - low, 1e-6)) / len(place))
     rng = np.random.default_rng([0x6D6F76, seed])
     moved = np.clip(target + rng.uniform(-reach_deg, reach_deg, target.shape), low, high)
     features = fixed.features[rows].copy()
     for pair in np.array_split(np.arange(features.shape[1]), (features.shape[1] + 1) // 2):
-        forward = GaussianProcess.fit(place, fixed.mean[:, [pair[0], pair[-1]]], mean=MEAN, length_max=LENGTH_MAX)
+        forward = GaussianProcess.fit(
+            place[few], fixed.mean[few][:, [pair[0], pair[-1]]], mean=MEAN, length_max=LENGTH_MAX, restarts=0
+        )
         step = forward.predict(moved) - forward.predict(target)
-        features[:, pair] += step[:, :len(pair)]
+        features[:, pair] += step[:, : len(pair)]
     return features, moved
 
 
 def _learn(fixed, seed):
     rows = _thin(np.arange(len(fixed.mean)), LEARN_MAX)
-    return GaussianProcess.fit(fixed.mean[rows], fixed.target[rows], fixed.noise_scale()[rows], mean=MEAN, seed=seed,
-                               length_max=LENGTH_MAX)
+    return GaussianProcess.fit(
+        fixed.mean[rows],
+        fixed.target[rows],
+        fixed.noise_scale()[rows],
+        mean=MEAN,
+        seed=seed,
+        length_max=LENGTH_MAX,
+    )
 
 
 def _thin(rows, most):

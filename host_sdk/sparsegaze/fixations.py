@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the frames of a recording to fixations: which frames belong together, which are blinks, what each says.
+"""From the frames of a recording to fixations: which belong together, which are blinks, what each says.
 
-All frames of a fixation share one error (where the eye really rested), so a fixation is one observation, however many
-frames it has; and its mean is far less noisy than the single frames that the device will have to judge.
+All frames of a fixation share one error (where the eye really rested), so a fixation is one observation,
+however many frames it has; and its mean is far less noisy than the single frames that the device will have to
+judge.
 """
 
 from dataclasses import dataclass
@@ -11,14 +12,14 @@ import numpy as np
 
 from .errors import RecordingError
 
-TARGETS_NEEDED = 9              # a 3 x 3 grid: below that nothing nonlinear can be told
-MOVE_DEG = 0.5                  # a target that has moved on by this much is another fixation (pursuit)
-GAP_US = 2_000_000              # and so is the same target after such a pause
+TARGETS_NEEDED = 9  # a 3 x 3 grid: below that nothing nonlinear can be told
+MOVE_DEG = 0.5  # a target that has moved on by this much is another fixation (pursuit)
+GAP_US = 2_000_000  # and so is the same target after such a pause
 BLINK_SIGMAS = 6.0
-FEW_FRAMES = 8                  # fewer frames than this have no spread to judge by
+FEW_FRAMES = 8  # fewer frames than this have no spread to judge by
 NOISE_SHARE, BIAS_DEG = 0.45, 0.3
 NEIGHBOURS, SCALE_MAX = 14, 300.0
-STEADY_FLOOR = 8.0              # feature steps; quantised noise-free recordings have a MAD of 0
+STEADY_FLOOR = 8.0  # feature steps; quantised noise-free recordings have a MAD of 0
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Fixations:
     mean [k, d] and target [k, 2] per fixation;  noise [d] rms of one frame about its fixation, feature units
     rejected  frames left out as blinks
     """
+
     features: np.ndarray
     target_deg: np.ndarray
     label: np.ndarray
@@ -43,24 +45,34 @@ class Fixations:
         keep[list(fixations)] = False
         rows = keep[self.label]
         label = (np.cumsum(keep) - 1)[self.label[rows]]
-        return Fixations(self.features[rows], self.target_deg[rows], label, self.mean[keep], self.target[keep],
-                         self.noise, self.rejected)
+        return Fixations(
+            self.features[rows],
+            self.target_deg[rows],
+            label,
+            self.mean[keep],
+            self.target[keep],
+            self.noise,
+            self.rejected,
+        )
 
     def frames(self, each):
         """At most `each` frames of every fixation, evenly spread: row indices."""
         starts = np.flatnonzero(np.r_[True, np.diff(self.label) > 0])
         counts = np.diff(np.r_[starts, len(self.label)])
-        rows = [start + np.unique(np.floor((np.arange(min(each, n)) + 0.5) * n / min(each, n)).astype(int))
-                for start, n in zip(starts, counts)]
+        rows = [
+            start + np.unique(np.floor((np.arange(min(each, n)) + 0.5) * n / min(each, n)).astype(int))
+            for start, n in zip(starts, counts)
+        ]
         return np.concatenate(rows)
 
     def noise_scale(self):
-        """How much noisier than others each fixation is as an observation of gaze: [k], relative variance, >= 1.
+        """How much noisier than others each fixation is as an observation of gaze: [k], variance ratio >= 1.
 
-        Where all channels are flat, a small disturbance of the features (pupil, lids) is a large one of gaze. The
-        features' slope comes from a plane through each target and its neighbours; NOISE_SHARE of a frame's noise stands
-        for the disturbance of a mean, BIAS_DEG for the eye's own part. Noise that is told apart lets the likelihood
-        choose longer or shorter length scales for the sake of the fixations that count.
+        Where all channels are flat, a small disturbance of the features (pupil, lids) is a large one of gaze.
+        The features' slope comes from a plane through each target and its neighbours; NOISE_SHARE of a
+        frame's noise stands for the disturbance of a mean, BIAS_DEG for the eye's own part. Noise that is
+        told apart lets the likelihood choose longer or shorter length scales for the sake of the fixations
+        that count.
         """
         disturbance2 = float(np.mean((NOISE_SHARE * self.noise) ** 2))
         if disturbance2 == 0.0:
@@ -72,7 +84,7 @@ class Fixations:
             plane = np.column_stack([np.ones(len(near)), self.target[near] - place])
             slope = np.linalg.lstsq(plane, self.mean[near], rcond=None)[0][1:]
             gaze2 = np.trace(np.linalg.inv(slope @ slope.T + 1e-3 * np.eye(2))) / 2
-            scale[i] = min(1.0 + disturbance2 * gaze2 / BIAS_DEG ** 2, SCALE_MAX)
+            scale[i] = min(1.0 + disturbance2 * gaze2 / BIAS_DEG**2, SCALE_MAX)
         return scale
 
 
@@ -93,13 +105,15 @@ def fixations(recording):
     x, target, label = x[keep], target[keep], np.unique(label[keep], return_inverse=True)[1]
     places = len(np.unique(np.round(target, 3), axis=0))
     if places < TARGETS_NEEDED:
-        raise RecordingError(f"{places} targets with valid frames are too few",
-                             f"record at least {TARGETS_NEEDED}, better 100, spread over the whole field")
+        raise RecordingError(
+            f"{places} targets with valid frames are too few",
+            f"record at least {TARGETS_NEEDED}, better 100, spread over the whole field",
+        )
     count = np.bincount(label)[:, None]
     mean = np.stack([np.bincount(label, column) for column in x.T], axis=1) / count
     place = np.stack([np.bincount(label, column) for column in target.T], axis=1) / count
     spare = len(x) - len(mean)
-    noise = np.sqrt(np.sum((x - mean[label]) ** 2, axis=0) / spare) if spare >= len(mean) else np.zeros(x.shape[1])
+    noise = np.sqrt(np.sum((x - mean[label]) ** 2, axis=0) / max(spare, 1)) * (spare >= len(mean))
     return Fixations(x, target, label, mean, place, noise, int(np.sum(~keep)))
 
 

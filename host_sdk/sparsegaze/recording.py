@@ -4,8 +4,9 @@
     # comment lines, "# key: value" is kept as meta
     t_us,s0,s1,...,s{d-1},target_az_deg,target_el_deg,valid
 
-t_us is device time, s0.. are features as the device sends them (unsigned 16 bit), targets are Fick angles in degrees,
-valid is 1 or 0; rows with valid = 0 may hold nan or nothing. Columns may stand in any order; unknown ones are skipped.
+t_us is device time, s0.. are features as the device sends them (unsigned 16 bit), targets are Fick angles in
+degrees, valid is 1 or 0; rows with valid = 0 may hold nan or nothing. Columns may stand in any order; unknown
+ones are skipped.
 """
 
 import csv
@@ -29,10 +30,11 @@ _RERECORD = "correct the line, set its valid to 0, or record again"
 class Recording:
     """n samples of d channels.
 
-    t_us [n] int64 device microseconds;  features [n, d] uint16;  target_deg [n, 2] float64, azimuth and elevation
-    valid [n] bool: the eye was on the target and open. Rows that are not valid may hold 0 features and nan targets.
-    meta: str -> str.  Raises RecordingError when the arrays do not fit together.
+    t_us [n] int64 device microseconds; features [n, d] uint16; target_deg [n, 2] float64, azimuth, elevation
+    valid [n] bool: the eye was on the target and open; other rows may hold 0 features and nan targets
+    meta: str -> str. Raises RecordingError when the arrays do not fit together.
     """
+
     t_us: np.ndarray
     features: np.ndarray
     target_deg: np.ndarray
@@ -45,15 +47,23 @@ class Recording:
         self.features = np.asarray(self.features, np.uint16)
         self.target_deg = np.asarray(self.target_deg, float)
         self.valid = np.asarray(self.valid, bool).reshape(-1)
-        if (self.features.ndim != 2 or len(self.features) != n or self.target_deg.shape != (n, 2)
-                or len(self.valid) != n or not 1 <= self.features.shape[1] <= CHANNELS_MAX):
+        if (
+            self.features.ndim != 2
+            or len(self.features) != n
+            or self.target_deg.shape != (n, 2)
+            or len(self.valid) != n
+            or not 1 <= self.features.shape[1] <= CHANNELS_MAX
+        ):
             raise RecordingError(
-                f"a recording of {n} rows with features {self.features.shape} and targets {self.target_deg.shape}",
-                f"give [n, 1..{CHANNELS_MAX}] features and [n, 2] targets")
+                f"{n} rows with features {self.features.shape} and targets {self.target_deg.shape}",
+                f"give [n, 1..{CHANNELS_MAX}] features and [n, 2] targets",
+            )
         bad = self.valid & ~(np.abs(self.target_deg) <= ANGLE_MAX_DEG).all(axis=1)
         if bad.any():
-            raise RecordingError(f"row {int(np.flatnonzero(bad)[0])} is valid but its target is no angle",
-                                 "give targets within +-90 deg, or set valid to 0")
+            raise RecordingError(
+                f"row {int(np.flatnonzero(bad)[0])} is valid but its target is no angle",
+                "give targets within +-90 deg, or set valid to 0",
+            )
 
     channels = property(lambda self: self.features.shape[1])
 
@@ -62,8 +72,9 @@ class Recording:
 
     def select(self, rows):
         """The recording of a subset of rows (index or mask), meta kept."""
-        return Recording(self.t_us[rows], self.features[rows], self.target_deg[rows], self.valid[rows],
-                         dict(self.meta))
+        return Recording(
+            self.t_us[rows], self.features[rows], self.target_deg[rows], self.valid[rows], dict(self.meta)
+        )
 
     def write(self, path):
         """Write the file whole, or not at all. Raises RecordingError when the place cannot be written."""
@@ -82,15 +93,17 @@ class Recording:
     def read(cls, path):
         """Read a file. Raises RecordingError naming file, line and column of the first thing that is wrong.
 
-        A last line without its newline that does not parse is the trace of an interrupted recording and is left out
-        (meta["cut"] = its line number). Time may run backwards (recordings may be concatenated): nothing here uses it.
+        A last line without its newline that does not parse is the trace of an interrupted recording and is
+        left out (meta["cut"] = its line number). Time may run backwards (recordings may be concatenated):
+        nothing here uses it.
         """
         try:
             with open(path, "rb") as file:
                 return _parse(os.fspath(path), file)
         except OSError as error:
-            raise RecordingError(f"cannot read {path}: {error.strerror}",
-                                 "name a CSV file made by sparsegaze record") from None
+            raise RecordingError(
+                f"cannot read {path}: {error.strerror}", "name a CSV file made by sparsegaze record"
+            ) from None
 
 
 class RecordingWriter:
@@ -120,8 +133,9 @@ class RecordingWriter:
         times = np.atleast_1d(np.asarray(t_us, np.int64))
         features = np.asarray(features).reshape(len(times), self.channels)
         targets = np.asarray(target_deg, float).reshape(len(times), 2)
-        for t, row, (az, el), good in zip(times.tolist(), features.tolist(), targets.tolist(),
-                                          np.atleast_1d(valid).tolist()):
+        for t, row, (az, el), good in zip(
+            times.tolist(), features.tolist(), targets.tolist(), np.atleast_1d(valid).tolist()
+        ):
             values = ",".join("%d" % v for v in row)
             self._lines.append("%d,%s,%s,%s,%d\n" % (t, values, _angle(az), _angle(el), bool(good)))
             self.rows += 1
@@ -167,7 +181,12 @@ def _parse(path, file):
             break
         number += 1
         if len(raw) > LINE_MAX_BYTES:
-            raise _at(path, number, "longer than any line of a recording", "name a CSV file made by sparsegaze record")
+            raise _at(
+                path,
+                number,
+                "longer than any line of a recording",
+                "name a CSV file made by sparsegaze record",
+            )
         try:
             line = raw.decode("utf-8-sig" if number == 1 else "utf-8").strip()
         except UnicodeDecodeError:
@@ -192,8 +211,13 @@ def _parse(path, file):
     if not rows:
         raise RecordingError(f"{path}: a header but no samples", "record again, with targets to look at")
     table = np.array(rows, float)
-    return Recording(table[:, 0].astype(np.int64), table[:, 1:1 + channels].astype(np.uint16),
-                     table[:, 1 + channels:3 + channels], table[:, 3 + channels] == 1, meta)
+    return Recording(
+        table[:, 0].astype(np.int64),
+        table[:, 1 : 1 + channels].astype(np.uint16),
+        table[:, 1 + channels : 3 + channels],
+        table[:, 3 + channels] == 1,
+        meta,
+    )
 
 
 def _header(path, number, line):
@@ -208,7 +232,12 @@ def _header(path, number, line):
     if missing:
         raise _at(path, number, f"no column {', '.join(missing)}", _FORM)
     if channels > CHANNELS_MAX:
-        raise _at(path, number, f"{channels} channels, more than {CHANNELS_MAX}", "keep the columns of one board's LEDs")
+        raise _at(
+            path,
+            number,
+            f"{channels} channels, more than {CHANNELS_MAX}",
+            "keep the columns of one board's LEDs",
+        )
     return [(name, names.index(name)) for name in wanted], channels
 
 
@@ -222,7 +251,7 @@ def _row(path, number, line, columns, channels):
     if text["valid"] not in ("0", "1"):
         raise _at(path, number, f"column valid: {text['valid'][:20]!r} is neither 0 nor 1", _RERECORD)
     valid = text["valid"] == "1"
-    row = [_number(path, number, "t_us", text["t_us"], -2 ** 62, 2 ** 62, True)]
+    row = [_number(path, number, "t_us", text["t_us"], -(2**62), 2**62, True)]
     for i in range(channels):
         row.append(_number(path, number, f"s{i}", text[f"s{i}"], 0, 65535, valid))
         if row[-1] != row[-1]:

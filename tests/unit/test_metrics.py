@@ -17,7 +17,8 @@ def fixation():
 @pytest.mark.parametrize("target", [(12.0, -8.0), (0.0, 0.0), (-20.0, 20.0), (170.0, 60.0)])
 def test_accuracy_is_etdqualitizers(fixation, target):
     assert metrics.accuracy_deg(*fixation, *target) == pytest.approx(
-        ETDQualitizer.accuracy(*fixation, *target), abs=1e-9)
+        ETDQualitizer.accuracy(*fixation, *target), abs=1e-9
+    )
 
 
 def test_precision_is_etdqualitizers(fixation):
@@ -31,7 +32,9 @@ def test_missing_samples_stay_in_place_as_in_etdqualitizer(fixation):
     az[[3, 50, 51]] = el[[3, 50, 51]] = np.nan
     assert metrics.rms_s2s_deg(az, el) == pytest.approx(ETDQualitizer.rms_s2s(az, el)[0], rel=1e-12)
     assert metrics.std_deg(az, el) == pytest.approx(ETDQualitizer.std(az, el)[0], rel=1e-12)
-    assert metrics.accuracy_deg(az, el, 11, -8) == pytest.approx(ETDQualitizer.accuracy(az, el, 11, -8), abs=1e-9)
+    assert metrics.accuracy_deg(az, el, 11, -8) == pytest.approx(
+        ETDQualitizer.accuracy(az, el, 11, -8), abs=1e-9
+    )
     assert metrics.bcea_deg2(az, el) == pytest.approx(ETDQualitizer.bcea(az, el)[0], rel=1e-9)
     assert metrics.data_loss_percent(az, el) == ETDQualitizer.data_loss_from_invalid(az, el) == 1.5
 
@@ -43,7 +46,9 @@ def test_data_loss_counts_either_coordinate():
 def test_no_samples_at_all_is_nan_not_an_error():
     none = np.full(5, np.nan)
     assert np.isnan(metrics.accuracy_deg(none, none, 0, 0)).all()
-    assert np.isnan([metrics.rms_s2s_deg(none, none), metrics.std_deg(none, none), metrics.bcea_deg2(none, none)]).all()
+    assert np.isnan(
+        [metrics.rms_s2s_deg(none, none), metrics.std_deg(none, none), metrics.bcea_deg2(none, none)]
+    ).all()
     assert metrics.data_loss_percent(none, none) == 100.0
     assert metrics.frame_error(none, none, 0, 0).frames == 0
 

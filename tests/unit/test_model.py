@@ -15,11 +15,16 @@ ffi, lib = pytest.importorskip("sparsegaze._core").ffi, pytest.importorskip("spa
 
 def parts(seed=0, n=64, d=6, bits=8, guards=3, gain_top=4096):
     rng = np.random.default_rng(seed)
-    return dict(offset=rng.integers(0, 3000, d), gain_q12=rng.integers(1, gain_top + 1, d),
-                bias=rng.integers(-2 ** 28, 2 ** 28, 2), trend=rng.integers(-2 ** 14, 2 ** 14, (2, d)),
-                centres=rng.integers(0, 256, (n, d)), weights=rng.integers(-32768, 32768, (n, 2)),
-                weight_frac_bits=bits,
-                guards=[(-10 ** 6, 10 ** 6, rng.integers(-128, 128, d)) for _ in range(guards)])
+    return dict(
+        offset=rng.integers(0, 3000, d),
+        gain_q12=rng.integers(1, gain_top + 1, d),
+        bias=rng.integers(-(2**28), 2**28, 2),
+        trend=rng.integers(-(2**14), 2**14, (2, d)),
+        centres=rng.integers(0, 256, (n, d)),
+        weights=rng.integers(-32768, 32768, (n, 2)),
+        weight_frac_bits=bits,
+        guards=[(-(10**6), 10**6, rng.integers(-128, 128, d)) for _ in range(guards)],
+    )
 
 
 def assert_same(model, features, recentre=(0.0, 0.0)):
@@ -31,21 +36,25 @@ def assert_same(model, features, recentre=(0.0, 0.0)):
     return flags
 
 
-@pytest.mark.parametrize("name, dtype", [("struct sg_model_head", m.HEAD), ("struct sg_model_guard", m.GUARD)])
+@pytest.mark.parametrize(
+    "name, dtype", [("struct sg_model_head", m.HEAD), ("struct sg_model_guard", m.GUARD)]
+)
 def test_layout_is_that_of_the_c_header(name, dtype):
     ctype = ffi.typeof(name)
     assert ffi.sizeof(ctype) == dtype.itemsize
     c_fields = {field: (info.offset, ffi.sizeof(info.type)) for field, info in ctype.fields}
-    assert c_fields == {field: (dtype.fields[field][1], dtype.fields[field][0].itemsize) for field in dtype.names}
+    assert c_fields == {
+        field: (dtype.fields[field][1], dtype.fields[field][0].itemsize) for field in dtype.names
+    }
 
 
 def test_limits_are_those_of_the_c_headers():
-    assert (m.MAGIC, m.VERSION, m.PAGE_BYTES, m.HEAD_BYTES, m.RECORD_BYTES, m.CHANNELS, m.SLOT_BYTES, m.VECTORS_MAX) == (
-        lib.SG_MODEL_MAGIC, lib.SG_MODEL_VERSION, lib.SG_MODEL_PAGE, lib.SG_MODEL_HEAD_BYTES, lib.SG_MODEL_RECORD_BYTES,
-        lib.SG_MODEL_CHANNELS, lib.SG_MODEL_SLOT_BYTES, lib.SG_MODEL_VECTORS_MAX)
+    for name in ("MAGIC", "VERSION", "HEAD_BYTES", "RECORD_BYTES", "CHANNELS", "SLOT_BYTES", "VECTORS_MAX"):
+        assert getattr(m, name) == getattr(lib, "SG_MODEL_" + name)
+    assert m.PAGE_BYTES == lib.SG_MODEL_PAGE
     assert m.RECORD.itemsize == m.RECORD_BYTES
-    assert (m.FLAG_VALID, m.FLAG_NO_MODEL, m.FLAG_OUT_OF_RANGE, m.FLAG_SATURATED, m.FLAG_STARVED) == (
-        lib.SG_FLAG_VALID, lib.SG_FLAG_NO_MODEL, lib.SG_FLAG_OUT_OF_RANGE, lib.SG_FLAG_SATURATED, lib.SG_FLAG_STARVED)
+    for name in ("VALID", "NO_MODEL", "OUT_OF_RANGE", "SATURATED", "STARVED"):
+        assert getattr(m, "FLAG_" + name) == getattr(lib, "SG_FLAG_" + name)
 
 
 def test_parts_come_back_as_they_went_in():
@@ -55,14 +64,18 @@ def test_parts_come_back_as_they_went_in():
         np.testing.assert_array_equal(getattr(model, name), given[name])
     assert (model.generation, model.vectors, model.channels, model.weight_frac_bits) == (5, 64, 6, 8)
     np.testing.assert_array_equal(model.half_c2, 8 * (given["centres"] ** 2).sum(1))
-    assert len(model.guards) == 3 and model.guards[0][:2] == (-10 ** 6, 10 ** 6)
-    assert model.crc == zlib.crc32(model.image[8:]) == lib.sg_model_crc32(0, model.image[8:], len(model.image) - 8)
+    assert len(model.guards) == 3 and model.guards[0][:2] == (-(10**6), 10**6)
+    assert (
+        model.crc
+        == zlib.crc32(model.image[8:])
+        == lib.sg_model_crc32(0, model.image[8:], len(model.image) - 8)
+    )
 
 
 def test_generation_changes_nothing_else():
     model = DeviceModel.from_parts(**parts())
-    other = model.with_generation(2 ** 32 - 1)
-    assert other.generation == 2 ** 32 - 1 and other.crc != model.crc
+    other = model.with_generation(2**32 - 1)
+    assert other.generation == 2**32 - 1 and other.crc != model.crc
     assert other.image[12:] == model.image[12:]
     assert other.with_generation(0).image == model.image
 
@@ -94,7 +107,9 @@ def test_emulation_equals_the_core_over_the_whole_kernel():
     # One channel, one vector at 0: T runs through every table entry up to the end of the kernel.
     model = DeviceModel.from_parts([0], [4096], [0, 0], [[0], [0]], [[0]], [[32767, -32768]], 6)
     assert_same(model, np.arange(65536, dtype=np.uint16)[:, None])
-    far = DeviceModel.from_parts([0] * 6, [4096] * 6, [0, 0], np.zeros((2, 6), int), [[0] * 6], [[32767, -32768]], 6)
+    far = DeviceModel.from_parts(
+        [0] * 6, [4096] * 6, [0, 0], np.zeros((2, 6), int), [[0] * 6], [[32767, -32768]], 6
+    )
     steps = np.linspace(0, 4095, 4000).astype(np.uint16)
     assert_same(far, np.repeat(steps[:, None], 6, axis=1))
 
@@ -102,17 +117,17 @@ def test_emulation_equals_the_core_over_the_whole_kernel():
 def test_kernel_is_the_exponential_within_its_bound():
     rng = np.random.default_rng(1)
     s, c = rng.integers(0, 4096, (400, 6)), rng.integers(0, 256, (50, 6))
-    exact = 65536 * np.exp(-0.5 * ((s[:, None] / 16 - c) ** 2).sum(-1) / m.U_STEPS ** 2)
+    exact = 65536 * np.exp(-0.5 * ((s[:, None] / 16 - c) ** 2).sum(-1) / m.U_STEPS**2)
     worst = np.abs(m.kernel_q16(s, c) - exact).max()
     assert worst <= 2.2
 
 
 def test_saturated_output_and_recentre_are_flagged():
-    model = DeviceModel.from_parts([0], [4096], [2 ** 31 - 1, 0], [[0], [0]], [[0]], [[0, 0]], 6)
+    model = DeviceModel.from_parts([0], [4096], [2**31 - 1, 0], [[0], [0]], [[0]], [[0, 0]], 6)
     assert assert_same(model, np.zeros((1, 1), np.uint16)).tolist() == [m.FLAG_OUT_OF_RANGE]
     model = DeviceModel.from_parts([0], [4096], [0, 0], [[0], [0]], [[0]], [[0, 0]], 8)
     assert assert_same(model, np.zeros((1, 1), np.uint16), (255.0, 0)).tolist() == [m.FLAG_VALID]
-    model = DeviceModel.from_parts([0], [4096], [2 ** 31 - 1, 0], [[0], [0]], [[0]], [[0, 0]], 8)
+    model = DeviceModel.from_parts([0], [4096], [2**31 - 1, 0], [[0], [0]], [[0]], [[0, 0]], 8)
     assert assert_same(model, np.zeros((1, 1), np.uint16), (200.0, 0)).tolist() == [m.FLAG_OUT_OF_RANGE]
 
 
@@ -131,7 +146,7 @@ def test_save_and_load(tmp_path):
     model.save(tmp_path / "a.sgm")
     assert DeviceModel.load(tmp_path / "a.sgm").image == model.image
     assert [p.name for p in tmp_path.iterdir()] == ["a.sgm"]
-    assert DeviceModel(model.image + b"\xff" * 100).image == model.image     # as read from a slot
+    assert DeviceModel(model.image + b"\xff" * 100).image == model.image  # as read from a slot
     with pytest.raises(ModelError, match="cannot write"):
         model.save(tmp_path / "no" / "a.sgm")
 
@@ -160,14 +175,27 @@ def test_every_truncation_is_refused(tmp_path):
 def _resealed(image, field, value):
     head = np.frombuffer(image, m.HEAD, 1).copy()
     head[field] = value
-    return m._sealed(head.tobytes() + image[m.PAGE_BYTES:])
+    return m._sealed(head.tobytes() + image[m.PAGE_BYTES :])
 
 
-@pytest.mark.parametrize("field, value, words", [
-    ("version", 2, "version 2"), ("vectors", 0, "0 vectors"), ("vectors", 63, "63 vectors"), ("length", 5, "vectors"),
-    ("channels", 0, "0 channels"), ("channels", 7, "7 channels"), ("channels", 5, "does not allow"),
-    ("kernel", 1, "does not allow"), ("weight_frac_bits", 11, "does not allow"), ("guards", 9, "does not allow"),
-    ("guards", 2, "does not allow"), ("reserved", 1, "does not allow"), ("pad", 1, "does not allow")])
+@pytest.mark.parametrize(
+    "field, value, words",
+    [
+        ("version", 2, "version 2"),
+        ("vectors", 0, "0 vectors"),
+        ("vectors", 63, "63 vectors"),
+        ("length", 5, "vectors"),
+        ("channels", 0, "0 channels"),
+        ("channels", 7, "7 channels"),
+        ("channels", 5, "does not allow"),
+        ("kernel", 1, "does not allow"),
+        ("weight_frac_bits", 11, "does not allow"),
+        ("guards", 9, "does not allow"),
+        ("guards", 2, "does not allow"),
+        ("reserved", 1, "does not allow"),
+        ("pad", 1, "does not allow"),
+    ],
+)
 def test_well_sealed_nonsense_is_refused_here_and_by_the_core(field, value, words):
     bad = _resealed(DeviceModel.from_parts(**parts()).image, field, value)
     with pytest.raises(ModelError, match=words):
@@ -199,9 +227,19 @@ def test_features_of_another_dimension_are_refused():
     assert len(model.predict(np.zeros((3, 6), np.uint16))[0]) == 3
 
 
-@pytest.mark.parametrize("field, value", [
-    ("weights", 32768), ("weights", -32769), ("centres", 256), ("centres", -1), ("gain_q12", 65536), ("offset", -1),
-    ("bias", 2 ** 31), ("trend", -2 ** 31 - 1)])
+@pytest.mark.parametrize(
+    "field, value",
+    [
+        ("weights", 32768),
+        ("weights", -32769),
+        ("centres", 256),
+        ("centres", -1),
+        ("gain_q12", 65536),
+        ("offset", -1),
+        ("bias", 2**31),
+        ("trend", -(2**31) - 1),
+    ],
+)
 def test_a_value_that_its_field_cannot_hold_is_refused_instead_of_wrapping(field, value):
     given = parts()
     given[field] = np.array(given[field], np.int64)

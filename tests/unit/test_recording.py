@@ -16,8 +16,13 @@ def recording(n=20, d=6, seed=0):
     target = rng.uniform(-22, 22, (n, 2))
     valid = rng.random(n) < 0.7
     target[~valid] = np.nan
-    return Recording(np.arange(n) * 3600, rng.integers(0, 65536, (n, d)), np.round(target, 4), valid,
-                     {"headset": "led2gaze", "seed": "7"})
+    return Recording(
+        np.arange(n) * 3600,
+        rng.integers(0, 65536, (n, d)),
+        np.round(target, 4),
+        valid,
+        {"headset": "led2gaze", "seed": "7"},
+    )
 
 
 @pytest.fixture
@@ -26,6 +31,7 @@ def file(tmp_path):
         path = tmp_path / "r.csv"
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
         return path
+
     return write
 
 
@@ -47,8 +53,10 @@ def test_rows_that_are_not_valid_may_hold_nan_or_nothing(file):
 
 
 def test_columns_in_any_order_unknown_ones_comments_blank_lines_bom_and_crlf(file):
-    text = ("\ufeff# person: 3\r\n\r\nvalid,note,s1,s0,target_el_deg,target_az_deg,t_us\r\n# hello\r\n"
-            "1,x,20,10,-2.5,1.5,1000\r\n")
+    text = (
+        "\ufeff# person: 3\r\n\r\nvalid,note,s1,s0,target_el_deg,target_az_deg,t_us\r\n# hello\r\n"
+        "1,x,20,10,-2.5,1.5,1000\r\n"
+    )
     r = Recording.read(file(text))
     assert (r.t_us[0], r.features[0].tolist(), r.target_deg[0].tolist()) == (1000, [10, 20], [1.5, -2.5])
     assert r.meta["person"] == "3"
@@ -58,26 +66,29 @@ def test_time_may_run_backwards(file):
     assert Recording.read(file(HEADER + GOOD + GOOD.replace("1000", "5"))).t_us.tolist() == [1000, 5]
 
 
-@pytest.mark.parametrize("text, line, column", [
-    (HEADER + GOOD + "2,nan,20,1,1,1\n", 3, "s0"),
-    (HEADER + GOOD + "2,10,,1,1,1\n", 3, "s1"),
-    (HEADER + "2,10,20,nan,1,1\n", 2, "target_az_deg"),
-    (HEADER + "2,10,20,1,inf,1\n", 2, "target_el_deg"),
-    (HEADER + "2,10,20,1,91,1\n", 2, "target_el_deg"),
-    (HEADER + "2,65536,20,1,1,1\n", 2, "s0"),
-    (HEADER + "2,-1,20,1,1,1\n", 2, "s0"),
-    (HEADER + "2,10.5,20,1,1,1\n", 2, "s0"),
-    (HEADER + "2,1e3000,20,1,1,0\n" + "2,70000,20,1,1,0\n", 3, "s0"),
-    (HEADER + "x,10,20,1,1,1\n", 2, "t_us"),
-    (HEADER + ",10,20,1,1,0\n", 2, "t_us"),
-    (HEADER + "2,10,20,1,1,2\n", 2, "valid"),
-    (HEADER + "2,10,20,1,1\n", 2, "valid"),
-    ("t_us,s0,s1,target_az_deg,valid\n" + GOOD, 1, "target_el_deg"),
-    ("t_us,s1,target_az_deg,target_el_deg,valid\n", 1, "s0"),
-    ("t_us,target_az_deg,target_el_deg,valid\n", 1, "s0"),
-    ("t_us,s0,s0,target_az_deg,target_el_deg,valid\n", 1, "s0"),
-    ("t_us,s0,s1,s2,s3,s4,s5,s6,target_az_deg,target_el_deg,valid\n", 1, "7 channels"),
-])
+@pytest.mark.parametrize(
+    "text, line, column",
+    [
+        (HEADER + GOOD + "2,nan,20,1,1,1\n", 3, "s0"),
+        (HEADER + GOOD + "2,10,,1,1,1\n", 3, "s1"),
+        (HEADER + "2,10,20,nan,1,1\n", 2, "target_az_deg"),
+        (HEADER + "2,10,20,1,inf,1\n", 2, "target_el_deg"),
+        (HEADER + "2,10,20,1,91,1\n", 2, "target_el_deg"),
+        (HEADER + "2,65536,20,1,1,1\n", 2, "s0"),
+        (HEADER + "2,-1,20,1,1,1\n", 2, "s0"),
+        (HEADER + "2,10.5,20,1,1,1\n", 2, "s0"),
+        (HEADER + "2,1e3000,20,1,1,0\n" + "2,70000,20,1,1,0\n", 3, "s0"),
+        (HEADER + "x,10,20,1,1,1\n", 2, "t_us"),
+        (HEADER + ",10,20,1,1,0\n", 2, "t_us"),
+        (HEADER + "2,10,20,1,1,2\n", 2, "valid"),
+        (HEADER + "2,10,20,1,1\n", 2, "valid"),
+        ("t_us,s0,s1,target_az_deg,valid\n" + GOOD, 1, "target_el_deg"),
+        ("t_us,s1,target_az_deg,target_el_deg,valid\n", 1, "s0"),
+        ("t_us,target_az_deg,target_el_deg,valid\n", 1, "s0"),
+        ("t_us,s0,s0,target_az_deg,target_el_deg,valid\n", 1, "s0"),
+        ("t_us,s0,s1,s2,s3,s4,s5,s6,target_az_deg,target_el_deg,valid\n", 1, "7 channels"),
+    ],
+)
 def test_what_is_wrong_is_named_by_file_line_and_column(file, text, line, column):
     path = file(text)
     with pytest.raises(RecordingError) as caught:
@@ -86,10 +97,21 @@ def test_what_is_wrong_is_named_by_file_line_and_column(file, text, line, column
     assert column in caught.value.message and caught.value.remedy
 
 
-@pytest.mark.parametrize("text", [
-    b"", b"\n\n", b"# only: comments\n", HEADER.encode(), bytes(range(256)) * 20, b"\x7fELF" + bytes(100),
-    b"t_us," * 5000, b"\xff\xfe" + HEADER.encode("utf-16-le"), b"{\"a\": 1}\n", HEADER.encode() + b"1,\xff,2,3,4,1\n",
-])
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"\n\n",
+        b"# only: comments\n",
+        HEADER.encode(),
+        bytes(range(256)) * 20,
+        b"\x7fELF" + bytes(100),
+        b"t_us," * 5000,
+        b"\xff\xfe" + HEADER.encode("utf-16-le"),
+        b'{"a": 1}\n',
+        HEADER.encode() + b"1,\xff,2,3,4,1\n",
+    ],
+)
 def test_empty_and_binary_files_are_refused_in_one_line(file, text):
     with pytest.raises(RecordingError) as caught:
         Recording.read(file(text))
@@ -111,9 +133,9 @@ def test_an_interrupted_recording_is_kept_up_to_its_last_whole_row(tmp_path):
     writer = RecordingWriter(path, 6, r.meta, flush_rows=10)
     for i in range(95):
         writer.write(r.t_us[i], r.features[i], r.target_deg[i], r.valid[i])
-    kept = Recording.read(path)         # the writer is neither closed nor flushed
+    kept = Recording.read(path)  # the writer is neither closed nor flushed
     assert 85 <= len(kept) <= 95
-    np.testing.assert_array_equal(kept.features, r.features[:len(kept)])
+    np.testing.assert_array_equal(kept.features, r.features[: len(kept)])
     writer.close()
     assert len(Recording.read(path)) == 95
     whole = path.read_bytes()
@@ -129,6 +151,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 
     def full(*_):
         raise OSError(28, "No space left on device")
+
     monkeypatch.setattr("os.replace", full)
     with pytest.raises(RecordingError, match="No space"):
         recording(50).write(path)

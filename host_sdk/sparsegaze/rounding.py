@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A device model's numbers as the device's integers, and the proof that their sum fits the accumulator."""
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from .model import S_FRAC, S_MAX, U_STEPS, WEIGHT_FRAC_BITS, DeviceModel, kernel_q16
+
+KERNEL_ERROR = 3.0  # of a device kernel value, Q0.16 steps
+CELL, CELLS_MAX = 0.2, 20_000  # length scales; see reach()
+
+
+def assemble(s, target, centres, offset, gain, rails, ridge):
+    """Trend, weights and bias in the device's integers, on the device's own kernel values.
+
+    Takes the finest weight format whose weights fit 16 bits and whose sum provably fits 32.
+    Returns (DeviceModel, (proven bound of |gaze| in degrees, what the accumulator holds)), or None when none
+    fits.
+    """
+    k = kernel_q16(s, centres) / 65536.0
+    design = np.hstack([k, s / 4096.0, np.ones((len(s), 1))])
+    n, d = len(centres), s.shape[1]
+    normal = design.T @ design
+    for bits in reversed(WEIGHT_FRAC_BITS):
+        damped = normal + np.diag(np.r_[np.full(n, ridge), np.full(d, 1e-9), 0.0]) * len(s)
+        fine = 2.0 ** -(bits + 16)
+        unit = np.r_[np.full(n, 2.0**-bits), np.full(d, 4096.0 * fine), fine]
+        whole = _round_in_turn(
+            damped, design.T @ target, unit, np.r_[np.arange(n, n + d), np.arange(n), n + d]
+        )
+        weights, trend, bias = whole[:n], whole[n : n + d].T, whole[-1]
+        if np.abs(weights).max() > 32767 or np.abs(whole[n:]).max() >= 2**31:
+            continue
+        bound = reach(weights, trend, bias, centres, rails)
+        if bound < 2**31:
+            model = DeviceModel.from_parts(offset, gain, bias, trend, centres, weights, bits, rails)
+            return model, (float(bound * fine), float(2**31 * fine))
+    return None
+
+
+def _round_in_turn(normal, moment, unit, order):
+    """Least-squares solution whose entries are whole multiples of `unit`: int64, same shape as moment.
+
+    Entries are rounded in the given order; after each, those still free are solved anew given all the rounded
+    ones.
+    """
+    scale = 1.0 / np.sqrt(np.diag(normal))
+    normal = normal * scale[:, None] * scale
+    normal[np.diag_indices(len(normal))] += 1e-14
+    inverse = cho_solve(cho_factor(normal), np.eye(len(normal)))
+    value = inverse @ (moment * scale[:, None])
+    step = unit / scale
+    whole = np.zeros(moment.shape, np.int64)
+    for i in order:
+        whole[i] = np.rint(value[i] / step[i]).astype(np.int64)
+        error = (value[i] - whole[i] * step[i]) / inverse[i, i]
+        value = value - np.outer(inverse[:, i], error)
+        inverse = inverse - np.outer(inverse[:, i], inverse[i]) / inverse[i, i]
+    return whole
+
+
+def reach(weights, trend, bias, centres, rails):
+    """Bound of |bias + trend . s + sum w k| over every input that no guard flags, in accumulator steps.
+
+    The guards' parallelepiped is cut into cells. Within a cell of half widths h around c, with f the sum of
+    kernels and L the length scale,   |value - value(c)| <= |gradient(c) . h| + sqrt(3)/2 |f| |h|^2 / L^2 :
+    f is a member of the kernel's function space, where |f| = sqrt(w' K w) and every second derivative is at
+    most |f| times the square root of the kernel's fourth, 3 / L^4. Each of the device's kernel values is
+    within KERNEL_ERROR of the exact (sg_gp.h).
+    """
+    live = np.flatnonzero(np.any([row for _, _, row in rails], axis=0))
+    rows = np.array([row[live] for _, _, row in rails], float)
+    low, high = (np.array([rail[i] for rail in rails], float) for i in (0, 1))
+    length = U_STEPS * S_FRAC
+    columns = np.linalg.inv(rows) / length
+    extent = np.linalg.norm(columns, axis=0) * (high - low)
+    cell = CELL
+    while np.prod(np.ceil(extent / cell)) > CELLS_MAX:
+        cell *= 1.1
+    cuts = np.ceil(extent / cell).astype(int)
+    parts = [lo + (np.arange(cut) + 0.5) * (hi - lo) / cut for lo, hi, cut in zip(low, high, cuts)]
+    middle = np.stack([g.ravel() for g in np.meshgrid(*parts, indexing="ij")], axis=1) @ columns.T
+    half = columns * (high - low) / (2 * cuts)
+    size2 = np.abs(half.T @ half).sum()
+    overlap = np.abs(half).sum(axis=1)  # cells outside the box hold no input
+    middle = middle[((middle > -overlap) & (middle < S_MAX / length + overlap)).all(axis=1)]
+    spot = centres[:, live] / U_STEPS
+    gram = np.exp(-0.5 * ((spot[:, None] - spot) ** 2).sum(-1))
+    norm = np.sqrt(
+        np.maximum(np.einsum("io,ij,jo->o", weights.astype(float), gram, weights.astype(float)), 0.0)
+    )
+    worst = 0.0
+    for block in np.array_split(middle, max(1, len(middle) // 2000)):
+        k = 65536.0 * np.exp(-0.5 * ((block[:, None] - spot) ** 2).sum(-1))
+        for o in range(2):
+            w, slope = weights[:, o].astype(float), trend[o, live].astype(float) * length
+            value = bias[o] + block @ slope + k @ w
+            gradient = slope + (k * w) @ spot - (k @ w)[:, None] * block
+            spread = np.abs(gradient @ half).sum(axis=1) + 65536.0 * np.sqrt(3.0) / 2 * norm[o] * size2
+            worst = max(worst, np.max(np.abs(value) + spread) + KERNEL_ERROR * np.abs(w).sum())
+    return float(worst * (1.0 + 1e-9))

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""gp.py against scikit-learn, brute force and finite differences, and in the cases where such code breaks."""
+
+import warnings
+
+import numpy as np
+import pytest
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+from sparsegaze import gp as module
+from sparsegaze.errors import CalibrationError
+from sparsegaze.gp import GaussianProcess, Hyper
+
+
+def data(n=60, d=6, seed=0, noise=0.2):
+    """Six smooth channels over +-20 deg, in feature units."""
+    rng = np.random.default_rng(seed)
+    gaze = rng.uniform(-20, 20, (n, 2))
+    angle = np.arange(d) * 2 * np.pi / d
+    place = 25 * np.stack([np.cos(angle), np.sin(angle)], 1)
+    bump = np.exp(-((gaze[:, None] - place) ** 2).sum(-1) / (2 * 18.0**2))
+    features = 45000 + 4096 * np.log2(1 - 0.5 * bump) + 5 * rng.standard_normal((n, d))
+    return features, gaze + noise * rng.standard_normal((n, 2))
+
+
+HYPER = Hyper(np.array([900.0, 1200, 700, 1500, 1000, 800]), 12.0, 0.4)
+
+
+def sklearn_twin(hyper):
+    kernel = ConstantKernel(hyper.signal_deg**2) * RBF(hyper.length) + WhiteKernel(hyper.noise_deg**2)
+    return GaussianProcessRegressor(kernel, optimizer=None, alpha=0.0)
+
+
+def covariance(gp):
+    x = gp.x / gp.hyper.length
+    k = gp.hyper.signal_deg**2 * np.exp(-0.5 * ((x[:, None] - x) ** 2).sum(-1))
+    return (
+        k
+        + gp.hyper.noise_deg**2 * np.diag(gp.noise_scale)
+        + gp.hyper.group_deg**2 * (gp.groups[:, None] == gp.groups)
+    )
+
+
+def test_mean_std_and_likelihood_equal_scikit_learns_at_equal_parameters():
+    features, gaze = data()
+    gp = GaussianProcess.fit(features, gaze, mean="zero", hyper=HYPER)
+    twin = sklearn_twin(HYPER).fit(features, gaze)
+    query = data(40, seed=5)[0]
+    mean, std = gp.predict(query, return_std=True)
+    theirs, spread = twin.predict(query, return_std=True)
+    np.testing.assert_allclose(mean, theirs, atol=1e-7)
+    np.testing.assert_allclose(std, np.sqrt(spread[:, 0] ** 2 - HYPER.noise_deg**2), atol=1e-6)
+    assert gp.lml == pytest.approx(twin.log_marginal_likelihood(twin.kernel_.theta), rel=1e-9)
+
+
+def test_optimised_likelihood_is_not_below_scikit_learns():
+    features, gaze = data(80)
+    gp = GaussianProcess.fit(features, gaze, mean="zero")
+    kernel = ConstantKernel(100.0, (1e-2, 1e8)) * RBF(np.full(6, 1000.0), (10, 1e6)) + WhiteKernel(
+        0.1, (1e-6, 1e2)
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        twin = GaussianProcessRegressor(kernel, alpha=0.0, n_restarts_optimizer=2, random_state=0).fit(
+            features, gaze
+        )
+    assert gp.lml > twin.log_marginal_likelihood_value_ - 0.5
+
+
+@pytest.mark.parametrize(
+    "mean, grouped", [("zero", False), ("constant", False), ("linear", False), ("linear", True)]
+)
+def test_gradient_equals_finite_differences(mean, grouped):
+    rng = np.random.default_rng(2)
+    n, d = 25, 3
+    z, y = rng.standard_normal((n, d)), rng.standard_normal((n, 2))
+    h = {"zero": np.empty((n, 0)), "constant": np.ones((n, 1)), "linear": np.hstack([np.ones((n, 1)), z])}[
+        mean
+    ]
+    squares = np.stack([(z[:, j, None] - z[:, j]) ** 2 for j in range(d)])
+    scale = rng.uniform(0.5, 2, n)
+    same = (np.arange(n)[:, None] // 3 == np.arange(n) // 3).astype(float) if grouped else None
+    theta = np.log(np.r_[1.1, 0.8, 2.0, 1.5, 0.3, [0.2] * grouped])
+    _, slope = module._likelihood(theta, squares, y, h, scale, same)
+    for i in range(len(theta)):
+        step = np.zeros_like(theta)
+        step[i] = 1e-5
+        up, down = (module._likelihood(theta + s, squares, y, h, scale, same)[0] for s in (step, -step))
+        assert slope[i] == pytest.approx((up - down) / 2e-5, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("mean", ["zero", "constant", "linear"])
+def test_leave_one_out_equals_brute_force(mean):
+    features, gaze = data(30)
+    gp = GaussianProcess.fit(features, gaze, mean=mean, hyper=HYPER)
+    predicted, spread = gp.loo()
+    for i in range(len(gp.x)):
+        rest = np.arange(len(gp.x)) != i
+        one, std = GaussianProcess.fit(gp.x[rest], gp.y[rest], mean=mean, hyper=HYPER).predict(
+            gp.x[i : i + 1], True
+        )
+        if mean != "linear":  # a linear mean is scaled by its data
+            assert spread[i] == pytest.approx(np.hypot(std[0], HYPER.noise_deg), rel=1e-6)
+        np.testing.assert_allclose(predicted[i], one[0], atol=1e-6)
+
+
+def test_leave_one_group_out_equals_brute_force():
+    features, gaze = data(36)
+    groups = np.arange(36) // 4
+    hyper = Hyper(HYPER.length, 12.0, 0.4, 0.3)
+    gp = GaussianProcess.fit(features, gaze, groups=groups, mean="constant", hyper=hyper)
+    residual = gp.loo_groups()
+    for label in range(9):
+        out = gp.groups == label
+        rest = GaussianProcess.fit(
+            gp.x[~out], gp.y[~out], groups=gp.groups[~out], mean="constant", hyper=hyper
+        )
+        np.testing.assert_allclose(residual[out], gp.y[out] - rest.predict(gp.x[out]), atol=1e-6)
+
+
+def test_grouped_and_scaled_noise_enter_the_covariance():
+    features, gaze = data(24)
+    hyper = Hyper(HYPER.length, 12.0, 0.4, 0.7)
+    scale = np.random.default_rng(0).uniform(0.5, 3, 24)
+    gp = GaussianProcess.fit(
+        features, gaze, noise_scale=scale, groups=np.arange(24) // 3, mean="zero", hyper=hyper
+    )
+    np.testing.assert_allclose(covariance(gp) @ gp.alpha, gp.y, atol=1e-8)
+    assert gp.condition == pytest.approx(np.linalg.cond(covariance(gp)), rel=0.2)
+    sign, logdet = np.linalg.slogdet(covariance(gp))
+    expected = -0.5 * np.sum(gp.y * np.linalg.solve(covariance(gp), gp.y)) - logdet - 24 * np.log(2 * np.pi)
+    assert gp.lml == pytest.approx(expected, rel=1e-9)
+
+
+def test_order_of_the_samples_is_irrelevant_to_the_bit():
+    features, gaze = data(50)
+    order = np.random.default_rng(3).permutation(50)
+    query = data(20, seed=9)[0]
+    np.testing.assert_array_equal(
+        GaussianProcess.fit(features, gaze).predict(query),
+        GaussianProcess.fit(features[order], gaze[order]).predict(query),
+    )
+
+
+def test_duplicates_and_near_duplicates_without_noise_are_solved_with_reported_jitter():
+    features, gaze = data(30)
+    twice = np.vstack([features, features, features + 1e-9])
+    labels = np.vstack([gaze] * 3)
+    gp = GaussianProcess.fit(twice, labels, mean="zero", hyper=Hyper(HYPER.length, 12.0, 0.0))
+    assert gp.jitter > 0 and gp.condition > 1e6
+    single = GaussianProcess.fit(features, gaze, mean="zero", hyper=Hyper(HYPER.length, 12.0, 0.05))
+    assert np.abs(gp.predict(features) - gaze).max() < 0.5
+    assert np.isfinite(gp.predict(single.x)).all()
+
+
+def test_same_input_with_contradicting_labels_becomes_noise():
+    features, gaze = data(30, noise=0.0)
+    gp = GaussianProcess.fit(
+        np.vstack([features, features]), np.vstack([gaze - 1, gaze + 1]), mean="constant"
+    )
+    assert 0.8 < gp.hyper.noise_deg < 1.3
+    assert np.sqrt(np.mean((gp.predict(features) - gaze) ** 2)) < 0.7
+
+
+def test_a_constant_channel_is_dropped_with_a_warning_and_changes_nothing():
+    features, gaze = data(40)
+    dead = features.copy()
+    dead[:, 2] = 123.0
+    with pytest.warns(UserWarning, match="s2"):
+        gp = GaussianProcess.fit(dead, gaze)
+    assert gp.dropped == (2,) and np.isinf(gp.hyper.length[2])
+    without = GaussianProcess.fit(np.delete(dead, 2, 1), gaze)
+    query = dead.copy()
+    query[:, 2] = 60000.0
+    np.testing.assert_allclose(gp.predict(query), without.predict(np.delete(dead, 2, 1)), atol=1e-6)
+
+
+def test_wildly_different_channel_scales_give_the_same_answer():
+    features, gaze = data(50)
+    scale = np.array([1.0, 1e-6, 1e6, 1e3, 1e-3, 1.0])
+    query = data(20, seed=3)[0]
+    np.testing.assert_allclose(
+        GaussianProcess.fit(features * scale, gaze).predict(query * scale),
+        GaussianProcess.fit(features, gaze).predict(query),
+        atol=0.02,
+    )
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_nan_and_infinity_are_refused(bad):
+    features, gaze = data(20)
+    features[3, 1] = bad
+    with pytest.raises(CalibrationError, match="nan or infinity"):
+        GaussianProcess.fit(features, gaze)
+    with pytest.raises(CalibrationError, match="nan or infinity"):
+        GaussianProcess.fit(gaze, features[:, :2])
+
+
+@pytest.mark.parametrize(
+    "n, mean, needed", [(0, "linear", None), (2, "linear", 9), (5, "linear", 9), (2, "constant", 3)]
+)
+def test_too_few_points_are_refused_with_the_number_needed(n, mean, needed):
+    features, gaze = data(20)
+    with pytest.raises(CalibrationError) as caught:
+        GaussianProcess.fit(features[:n], gaze[:n], mean=mean)
+    assert needed is None or str(needed) in caught.value.remedy
+
+
+def test_five_points_give_a_finite_smooth_answer_with_a_constant_mean():
+    features, gaze = data(5)
+    gp = GaussianProcess.fit(features, gaze, mean="constant")
+    assert np.abs(gp.predict(data(50, seed=2)[0])).max() < 60
+
+
+def test_no_channel_varies_and_channels_that_copy_each_other_are_refused():
+    gaze = data(20)[1]
+    with pytest.raises(CalibrationError, match="no channel"):
+        GaussianProcess.fit(np.ones((20, 6)), gaze)
+    copied = np.repeat(data(20)[0][:, :1], 6, axis=1)
+    with pytest.raises(CalibrationError, match="linear"):
+        GaussianProcess.fit(copied, gaze, mean="linear")
+    assert np.isfinite(GaussianProcess.fit(copied, gaze, mean="constant").lml)
+
+
+def test_all_targets_on_a_line_and_all_targets_equal():
+    features, gaze = data(40)
+    gaze[:, 1] = 3.0
+    gp = GaussianProcess.fit(features, gaze, mean="constant")
+    np.testing.assert_allclose(gp.predict(features)[:, 1], 3.0, atol=0.2)
+    gaze[:, 0] = -1.0
+    np.testing.assert_allclose(
+        GaussianProcess.fit(features, gaze, mean="constant").predict(features), gaze, atol=1e-3
+    )
+
+
+def test_condition_number_near_1e16_still_predicts():
+    features, gaze = data(200, noise=0.0)
+    gp = GaussianProcess.fit(features, gaze, mean="zero", hyper=Hyper(HYPER.length * 50, 1e4, 1e-4))
+    assert gp.condition > 1e11 and np.isfinite(gp.predict(features)).all()
+
+
+def test_prediction_in_blocks_is_prediction_at_once(monkeypatch):
+    features, gaze = data(30)
+    gp = GaussianProcess.fit(features, gaze, hyper=HYPER)
+    whole = gp.predict(features, True)
+    monkeypatch.setattr(module, "_blocks", lambda n, width: [slice(i, min(i + 7, n)) for i in range(0, n, 7)])
+    for a, b in zip(whole, gp.predict(features, True)):
+        np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+def test_unknown_mean_is_a_programming_error():
+    with pytest.raises(ValueError, match="cubic"):
+        GaussianProcess.fit(*data(20), mean="cubic")
