@@ -43,4 +43,7 @@ double sim_window_weight(const struct sim_window *window, const double away[3]);
 void sim_add_pairs(const struct sim_scene *scene, double weight, const double *sensor_part,
                    const double *emitter_part, double *out);
 
+// Factors of every spot of the face, from its visibility. Returns 0, or -1 for lack of memory.
+int sim_prepare_face(struct sim_scene *scene);
+
 #endif
