@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
+from threadpoolctl import threadpool_limits
 
 from .errors import CalibrationError, ModelError
 from .fixations import TARGETS_NEEDED, fixations
@@ -298,6 +299,7 @@ class FitReport:
     distil: DistilReport
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")  # the matrices are small: threads cost 20 times their gain
 def fit_recording(recording, n_vectors=64, seed=0):
     """Recording -> FitResult. Raises RecordingError or CalibrationError; warns of channels it drops.
 
