@@ -18,7 +18,7 @@ GAP_US = 2_000_000  # and so is the same target after such a pause
 BLINK_SIGMAS = 6.0
 FEW_FRAMES = 8  # fewer frames than this have no spread to judge by
 NOISE_SHARE, BIAS_DEG = 0.45, 0.3
-NEIGHBOURS, SCALE_MAX = 14, 300.0
+NEIGHBOURS, SCALE_MAX = 14, 30.0
 STEADY_FLOOR = 8.0  # feature steps; quantised noise-free recordings have a MAD of 0
 
 
