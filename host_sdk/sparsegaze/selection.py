@@ -18,6 +18,8 @@ LAG_FRAMES = 4  # a lid closes within 50..80 ms = 14..22 frames of 3.6 ms; noise
 PAD_FRAMES = 6  # lids move slowly before and after the part that a derivative shows
 JUMP_FLOOR = 0.012 * OCTAVE  # steps smaller than this are fixational movement, whatever the noise
 LEVEL_FLOOR = 0.020 * OCTAVE
+STRONG_JUMP = 0.05 * OCTAVE  # a lid, or a saccade of degrees; microsaccades and drift stay below
+STRONG_LEVEL = 0.10 * OCTAVE
 JUMP_SIGMAS = 8.0
 LEVEL_SIGMAS = 6.0
 LEAST_SHARE = 0.25  # of a settled fixation that must survive, or none of it is trusted
@@ -61,7 +63,8 @@ def blinks(features, noise=None):
     features  [n, d], consecutive frames of one settled fixation; noise: noise_of() the whole recording.
     Two tests. Derivative: the mean of LAG_FRAMES frames against that of the next LAG_FRAMES, any channel.
     Level: the steady rest against its own densest half, any channel, which finds shut lids between two
-    movements.
+    movements. What passes a low threshold counts only where it hangs together with something above a high
+    one: the slow ends of a blink go with it, a microsaccade stays.
     """
     x = np.asarray(features, float)
     n = len(x)
@@ -72,20 +75,30 @@ def blinks(features, noise=None):
     mean = (total[LAG_FRAMES:] - total[:-LAG_FRAMES]) / LAG_FRAMES
     step = np.abs(mean[LAG_FRAMES:] - mean[:-LAG_FRAMES])
     limit = np.maximum(JUMP_SIGMAS * noise * np.sqrt(2.0 / LAG_FRAMES), JUMP_FLOOR)
-    moving = np.zeros(n, bool)
-    moving[LAG_FRAMES : LAG_FRAMES + len(step)] = (step > limit).any(axis=1)
+    moving, strong = np.zeros(n, bool), np.zeros(n, bool)
+    at = slice(LAG_FRAMES, LAG_FRAMES + len(step))
+    moving[at] = (step > limit).any(axis=1)
+    strong[at] = (step > np.maximum(limit, STRONG_JUMP)).any(axis=1)
     moving = _dilate(moving, PAD_FRAMES)
-    steady = ~moving
+    steady = ~_touched(moving, strong)
     if steady.sum() < LEAST_SHARE * n:
         return np.ones(n, bool)
     centre, spread = _shortest_half(x[steady])
     # A blink widens the densest half too; a resting eye never does by more than twice the floor.
     spread = np.maximum(noise, np.minimum(spread, 2 * LEVEL_FLOOR / LEVEL_SIGMAS))
-    level = np.abs(x - centre) > np.maximum(LEVEL_SIGMAS * spread, LEVEL_FLOOR)
-    # One noisy frame is no blink; a lid moves several frames, and only those are widened.
-    far = level.any(axis=1)
-    padded = np.r_[False, far, False]
-    return moving | far | _dilate(far & (padded[:-2] | padded[2:]), PAD_FRAMES)
+    limit = np.maximum(LEVEL_SIGMAS * spread, LEVEL_FLOOR)
+    off = np.abs(x - centre)
+    strong |= (off > np.maximum(limit, STRONG_LEVEL)).any(axis=1)
+    return _dilate(_touched(moving | (off > limit).any(axis=1) | strong, strong), PAD_FRAMES)
+
+
+def _touched(weak, strong):
+    """The runs of weak [n] that hold a true of strong [n]."""
+    edges = np.flatnonzero(np.diff(np.r_[False, weak, False].astype(int)))
+    out = np.zeros(len(weak), bool)
+    for begin, end in zip(edges[::2], edges[1::2]):
+        out[begin:end] = strong[begin:end].any()
+    return out
 
 
 def _shortest_half(x):

@@ -68,7 +68,7 @@ def test_a_clean_run_keeps_nearly_every_settled_frame_and_no_other():
 
 
 @pytest.mark.parametrize("start_s", [0.55, 0.7, 0.85])
-@pytest.mark.parametrize("octaves", [0.05, 0.3, 1.0])
+@pytest.mark.parametrize("octaves", [0.15, 0.3, 1.5])
 def test_a_blink_is_left_out_and_the_rest_of_its_fixation_kept(start_s, octaves):
     run = Recorded(seed=3)
     for target in range(0, 40, 4):
@@ -127,6 +127,16 @@ def test_microsaccades_of_a_tenth_of_a_degree_cost_nothing():
     chosen = Recorded(seed=8, spoil=tremble).select()
     assert chosen.used_targets == 40
     assert chosen.valid.mean() > 0.45
+
+
+def test_a_fixation_that_shifts_by_a_degree_is_kept_whole():
+    def shift(run, eye, _):
+        since = run.t_us - run.onset_us[run.index]
+        eye[since > 760_000] += (0.8, -0.6)
+
+    run = Recorded(seed=11, spoil=shift)
+    settled = run.t_us - run.onset_us[run.index] >= 500_000
+    assert run.select().valid[settled].mean() > 0.97
 
 
 def test_noise_estimate_ignores_blinks_and_drift():
