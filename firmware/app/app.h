@@ -14,6 +14,10 @@
 #include "sg_track.h"
 #include "sg_wire.h"
 
+// Not inlined: everything ends up in main() otherwise, and what a function has on the stack stays there while
+// others, later, go deeper.
+#define NOT_KEPT __attribute__((noinline))
+
 #define APP_FIRMWARE_VERSION 0x000100UL      // product version, major minor patch: 0.1.0
 
 // Everything that is not a model or a live record. One instance, in main.c.

@@ -254,10 +254,16 @@ static void request(const struct sg_head *head, uint8_t n, uint32_t arrived_us)
         hal_after_sending(body.mode.mode ? HAL_AFTER_BAUD_500K : HAL_AFTER_BAUD_1M);
 }
 
+// Of its own for the decoder's copy of the packet.
+NOT_KEPT static int receive(uint8_t byte, struct sg_head *head)
+{
+    return sg_link_receive(&app.link, byte, head, body.bytes);
+}
+
 void app_on_byte(uint8_t byte, uint32_t zero_us)
 {
     struct sg_head head;
-    const int n = sg_link_receive(&app.link, byte, &head, body.bytes);
+    const int n = receive(byte, &head);
     if (n >= 0)
         request(&head, (uint8_t)n, zero_us);
 }

@@ -6,11 +6,15 @@
 enum {
     // Stream frames leave this much of the send queue to answers.
     REPLY_RESERVE = SG_WIRE_FRAME_MAX,
+    // A blink leaves the calibrated range before the lids are where they were: this long after the last frame
+    // out of range a gaze may look right and be wrong. 108 ms at 3.84 ms.
+    RECOVERY_FRAMES = 28,
 };
 
 struct app_state app;
 
 static uint16_t previous_exposure[HAL_CHANNELS];
+static uint8_t recovery;                // frames left that are RECOVERING
 
 void app_count(uint16_t *counter)
 {
@@ -50,7 +54,7 @@ static uint8_t exposures_changed(const struct hal_frame *frame)
     return changed ? SG_FLAG_EXPOSURE : 0;
 }
 
-static void expose_next(const struct hal_frame *frame)
+NOT_KEPT static void expose_next(const struct hal_frame *frame)
 {
     uint16_t exposure[HAL_CHANNELS];
     uint8_t changed = 0;
@@ -115,6 +119,10 @@ void app_on_frame(const struct hal_frame *frame)
     flags |= exposures_changed(frame);
     if (app_model_slot() == SG_SLOT_RAM)
         flags |= SG_FLAG_TRIAL;
+    if (recovery) {
+        flags |= SG_FLAG_RECOVERING;
+        recovery--;
+    }
     out.raw.flags = flags;
     out.raw.model_crc = model ? model->crc : 0;
     out.raw.recentre_az_deg_q7 = recentre[0];
@@ -123,6 +131,8 @@ void app_on_frame(const struct hal_frame *frame)
     HAL_BEGIN(HAL_SECTION_INFER);
     sg_track_infer(model, out.raw.feature, flags, recentre, &gaze);
     HAL_END(HAL_SECTION_INFER);
+    if (gaze.flags & SG_FLAG_OUT_OF_RANGE)
+        recovery = RECOVERY_FRAMES;
     gaze.t_us = frame->t_us;
     gaze.infer_us = (uint16_t)(hal_now_us() - (frame->t_us + frame->span_us));
 
@@ -147,8 +157,7 @@ void app_describe(struct sg_hello *hello)
     hello->channels = HAL_CHANNELS;
 }
 
-// Not inlined: main() would keep its stack for ever.
-__attribute__((noinline)) static void start(void)
+NOT_KEPT static void start(void)
 {
     uint16_t exposure[HAL_CHANNELS];
     struct sg_hello hello;

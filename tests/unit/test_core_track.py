@@ -8,7 +8,9 @@ import pytest
 from core_models import Parts, View, features_near, random_parts, scaled, twin
 from sparsegaze._core import ffi, lib
 
-RAW_FLAGS = (lib.SG_FLAG_SATURATED, lib.SG_FLAG_STARVED, lib.SG_FLAG_EXPOSURE, lib.SG_FLAG_TRIAL)
+RAW_FLAGS = (lib.SG_FLAG_SATURATED, lib.SG_FLAG_STARVED, lib.SG_FLAG_EXPOSURE, lib.SG_FLAG_TRIAL,
+             lib.SG_FLAG_RECOVERING)
+BAD_FLAGS = lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_RECOVERING
 
 
 def plain(bias_deg_q7=(0, 0)):
@@ -37,10 +39,10 @@ def test_no_model_is_zero_with_its_flag_and_never_valid():
 def test_valid_for_exactly_the_right_flags(inside):
     view = View(plain((128, -256)).image())
     feature = [200] * 6 if inside else [99] + [200] * 5
-    for chosen in itertools.product((0, 1), repeat=4):
+    for chosen in itertools.product((0, 1), repeat=5):
         raw = sum(flag for flag, on in zip(RAW_FLAGS, chosen) if on)
         result, gaze, flags = infer(view.view, feature, raw | lib.SG_FLAG_VALID | lib.SG_FLAG_NO_MODEL)
-        good = inside and not raw & (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED)
+        good = inside and not raw & BAD_FLAGS
         expected = raw | (lib.SG_FLAG_VALID if good else 0) | (0 if inside else lib.SG_FLAG_OUT_OF_RANGE)
         assert (result, gaze, flags) == (lib.SG_OK, (128, -256), expected)
 
@@ -59,7 +61,7 @@ def test_batch_equals_single_frames_and_the_twin():
     rng = np.random.default_rng(5)
     parts = random_parts(rng, 40, guards=1)
     feature = features_near(rng, parts, 200)
-    raw = rng.choice([0, 8, 16, 32, 64], 200).astype(np.uint8)
+    raw = rng.choice([0, 8, 16, 32, 64, 128], 200).astype(np.uint8)
     view, out = View(parts.image()), ffi.new("struct sg_gaze[200]")
     recentre = ffi.new("int16_t[2]", [100, -50])
     lib.sg_batch_infer(view.view, ffi.from_buffer("uint16_t[]", feature), ffi.from_buffer("uint8_t[]", raw),
@@ -72,7 +74,7 @@ def test_batch_equals_single_frames_and_the_twin():
         expected = np.clip(np.clip(deg[i], -32768, 32767) + [100, -50], -32768, 32767)
         assert list(single[1]) == list(expected)
         assert bool(single[2] & lib.SG_FLAG_VALID) == (
-            not outside[i] and not raw[i] & 24 and single[0] == lib.SG_OK)
+            not outside[i] and not raw[i] & BAD_FLAGS and single[0] == lib.SG_OK)
 
 
 def test_features_of_a_frame_are_those_of_its_channels_with_flags_joined():

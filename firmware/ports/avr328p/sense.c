@@ -16,13 +16,16 @@
 //
 // The charge is always done before the next light. In cycles of a slot of 10240, at the longest exposure and
 // with bytes back to back both ways:
-//     110   the light's interrupt waits for another to end (it has priority over all others)
-//    4948   settling at most 84, and the exposure
+//     145   to the light: its interrupt waits for another to end (none comes before it), then its entry
+//      80   settling
+//    4864   the exposure
 //    3232   to the end of the fourth code: 11.5 ADC clocks of 64, then 3 * 13. Free-running: no code involved
-//     605   its interrupt waits: priority below the UART's two, which take 120 of every 160 cycles then
-//     996   100 of its own, up to 64 until the ADC's prescaler turns, 13 ADC clocks
-//    9891   in all: 349 (22 us) to spare
+//     605   its interrupt waits: it comes after the UART's two, which take 120 of every 160 cycles then
+//      95   its entry
+//     896   up to 64 until the ADC's prescaler turns, 13 ADC clocks
+//    9917   in all: 323 (20 us) to spare
 #include "port.h"
+#include "serial_ring.h"
 
 enum {
     LED_FIRST_ANODE = 2,            // anodes on PD2..PD7, cathodes on PC0..PC5
@@ -46,7 +49,7 @@ enum {
     // what leakage does. Room light on a nominal LED is 10 codes.
     OTHER_LIGHT_Q4 = 5 * 16,
     NO_OTHER_LIGHT_Q4 = 4 * 16,
-    SETTLE_CYCLES = 5 * CYCLES_PER_US - 34,     // 34: from the light to the release without the delay
+    SETTLE_CYCLES = 5 * CYCLES_PER_US - 50,     // 50: from the light to the release without the delay
     LATE_CYCLES = 40 * CYCLES_PER_US,
     SOON_CYCLES = 64,               // a compare value nearer than this may be missed
     WAIT_CYCLES = 60 * CYCLES_PER_US,
@@ -122,7 +125,10 @@ static inline __attribute__((always_inline)) void light_and_release(void)
     ADCSRA = ADC_ARMED;
     const uint16_t trigger = trigger_cycles[led];
     const uint8_t ddrc = DDRC_ALL & ~bit;
-    __builtin_avr_delay_cycles(SETTLE_CYCLES);
+    if (UCSR0A & (1 << RXC0))
+        serial_receive();               // this interrupt takes as long as two bytes
+    else
+        __builtin_avr_delay_cycles(SETTLE_CYCLES);
 
     // The pull-up is on for the one cycle between the two: the node is at Vcc anyway.
     uint16_t release;

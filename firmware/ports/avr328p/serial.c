@@ -2,19 +2,19 @@
 // UART0 with a ring each way. At 1 Mbaud a byte takes 160 cycles and the receiver bridges two: the interrupts
 // are short.
 #include "port.h"
+#include "serial_ring.h"
 
 enum {
-    RX_RING = 128,                      // power of two
     TX_RING = 192,                      // a frame of all three streams (92), an answer (72), and some
     BYTES_PER_POLL = 32,                // so that a flood of bytes cannot keep a frame waiting
     DRAIN_CYCLES = 4 * 10 * 2 * 16,     // the last two bytes leave the shift register, at the lower speed
 };
 
-static uint8_t rx_ring[RX_RING];
-static volatile uint8_t rx_head;        // written by the interrupt
-static uint8_t rx_tail;
-static volatile uint16_t rx_overruns;
-static volatile uint16_t zero_ticks;    // TCNT1 when the latest 0x00 arrived
+uint8_t rx_ring[RX_RING];
+volatile uint8_t rx_head;
+uint8_t rx_tail;
+volatile uint16_t rx_overruns;
+volatile uint16_t zero_ticks;
 
 static uint8_t tx_ring[TX_RING];
 static uint8_t tx_head;
@@ -25,37 +25,71 @@ static uint8_t after;
 static uint16_t drained_ticks;
 static uint8_t drained;
 
-ISR(USART_RX_vect)
+ISR(USART_RX_vect, ISR_NAKED)
 {
-    HAL_BEGIN(HAL_SECTION_SERIAL);
-    const uint8_t status = UCSR0A;
-    const uint8_t byte = UDR0;
-    const uint8_t head = rx_head;
-    const uint8_t next = (head + 1) & (RX_RING - 1);
-    if (status & (1 << DOR0))
-        rx_overruns++;
-    if (next != rx_tail) {
-        rx_ring[head] = byte;
-        rx_head = next;
-    } else {
-        rx_overruns++;
-    }
-    if (byte == 0)
-        zero_ticks = TCNT1;
-    HAL_END(HAL_SECTION_SERIAL);
+    __asm__ volatile("push r24" "\n\t"
+                     "in r24, __SREG__" "\n\t"
+                     "push r24" "\n\t"
+                     "push r25" "\n\t"
+                     "push r30" "\n\t"
+                     "push r31" "\n\t"
+                     "ldi r24, %[begin]" "\n\t"
+                     "out %[mark], r24"
+                     : : [begin] "M"(2 * HAL_SECTION_SERIAL + 1), [mark] "I"(_SFR_IO_ADDR(GPIOR0)));
+    serial_receive();
+    __asm__ volatile("ldi r24, %[end]" "\n\t"
+                     "out %[mark], r24" "\n\t"
+                     "pop r31" "\n\t"
+                     "pop r30" "\n\t"
+                     "pop r25" "\n\t"
+                     "pop r24" "\n\t"
+                     "out __SREG__, r24" "\n\t"
+                     "pop r24" "\n\t"
+                     "reti"
+                     : : [end] "M"(2 * HAL_SECTION_SERIAL + 2), [mark] "I"(_SFR_IO_ADDR(GPIOR0)));
 }
 
-ISR(USART_UDRE_vect)
+// In assembler for the same reason as serial_receive().
+ISR(USART_UDRE_vect, ISR_NAKED)
 {
-    HAL_BEGIN(HAL_SECTION_SERIAL);
-    uint8_t tail = tx_tail;
-    UDR0 = tx_ring[tail];
-    if (++tail == TX_RING)
-        tail = 0;
-    tx_tail = tail;
-    if (tail == tx_head)
-        UCSR0B = (1 << RXCIE0) | (1 << RXEN0) | (1 << TXEN0);
-    HAL_END(HAL_SECTION_SERIAL);
+    __asm__ volatile("push r24" "\n\t"
+                     "in r24, __SREG__" "\n\t"
+                     "push r24" "\n\t"
+                     "push r30" "\n\t"
+                     "push r31" "\n\t"
+                     "ldi r24, %[begin]" "\n\t"
+                     "out %[mark], r24" "\n\t"
+                     "lds r30, %[tail]" "\n\t"
+                     "mov r24, r30" "\n\t"
+                     "ldi r31, 0" "\n\t"
+                     "subi r30, lo8(-(%[ring]))" "\n\t"
+                     "sbci r31, hi8(-(%[ring]))" "\n\t"
+                     "ld r30, Z" "\n\t"
+                     "sts %[data], r30" "\n\t"
+                     "inc r24" "\n\t"
+                     "cpi r24, %[size]" "\n\t"
+                     "brne 1f" "\n\t"
+                     "ldi r24, 0" "\n"
+                     "1:" "\t" "sts %[tail], r24" "\n\t"
+                     "lds r30, %[head]" "\n\t"
+                     "cpse r24, r30" "\n\t"
+                     "rjmp 2f" "\n\t"
+                     "ldi r24, %[empty]" "\n\t"
+                     "sts %[control], r24" "\n"
+                     "2:" "\t" "ldi r24, %[end]" "\n\t"
+                     "out %[mark], r24" "\n\t"
+                     "pop r31" "\n\t"
+                     "pop r30" "\n\t"
+                     "pop r24" "\n\t"
+                     "out __SREG__, r24" "\n\t"
+                     "pop r24" "\n\t"
+                     "reti"
+                     : : [begin] "M"(2 * HAL_SECTION_SERIAL + 1), [end] "M"(2 * HAL_SECTION_SERIAL + 2),
+                     [mark] "I"(_SFR_IO_ADDR(GPIOR0)), [tail] "i"(&tx_tail), [head] "i"(&tx_head),
+                     [ring] "i"(tx_ring), [data] "i"(_SFR_MEM_ADDR(UDR0)), [size] "M"(TX_RING),
+                     [control] "i"(_SFR_MEM_ADDR(UCSR0B)),
+                     [empty] "M"((1 << RXCIE0) | (1 << RXEN0) | (1 << TXEN0))
+                     : "memory");
 }
 
 void serial_start(void)
