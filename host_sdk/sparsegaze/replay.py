@@ -101,7 +101,8 @@ def run(path, model):
             "use the model that was fitted to recordings of this headset",
         )
     t_us = integers(path, columns, lines, "t_us", 0, 2**63 - 1) if "t_us" in columns else np.arange(n)
-    carried = lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_EXPOSURE | lib.SG_FLAG_TRIAL
+    # Everything in a gaze's flags but what the inference itself finds comes from the raw frame.
+    carried = 0xFF & ~(lib.SG_FLAG_VALID | lib.SG_FLAG_NO_MODEL | lib.SG_FLAG_OUT_OF_RANGE)
     device = all(name in columns for name in ("azimuth_deg", "elevation_deg", "flags"))
     flags = integers(path, columns, lines, "flags", 0, 255) if device else np.zeros(n, np.int64)
     recentre = np.zeros((n, 2), np.int16)
