@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from demo_picture import draw
-from sparsegaze import calibrate, flash, validate
+from sparsegaze import calibrate, flash, targets, validate
 from sparsegaze.device import Device
 from sparsegaze.errors import SparsegazeError
+from sparsegaze.screen import screen_for
 from sparsegaze.transport import open_link
 from sparsegaze.virtual import VirtualNano
 from sparsegaze.wire import lib
@@ -86,15 +87,14 @@ def run(options):
     with VirtualNano(person=seed, state_dir=state) as nano:
         with Device(nano.port) as device:
             after = model_crc(device)
-        nano.control.frames(latency_log)
-        nano.control.markers_clear()
-        validation = validate.run(nano.port, n_targets=options.held_out, seed=seed,
-                                  avoid_deg=calibration.capture.run.plan.target_deg, csv=out / "gaze.csv",
-                                  progress=progress)
-        nano.control.frames(None)
-        sections, counters = nano.control.markers(), nano.control.counters()
-        with Device(nano.port) as device:
-            status = device.status()
+            nano.control.frames(latency_log)
+            nano.control.markers_clear()
+            calibrated = calibration.capture.run.plan.target_deg
+            plan = targets.validation_plan(options.held_out, seed, avoid_deg=calibrated)
+            validation = validate.measure(device, screen_for(device), plan, csv=out / "gaze.csv", progress=progress)
+            nano.control.frames(None)
+            sections, counters = nano.control.markers(), nano.control.counters()
+            hello, status = device.hello, device.status()
     measured = validation.report()
     process = calibration.fit.gp.predict(validation.run.frames["features"].astype(float))
     gp_deg = np.asarray(process[0] if isinstance(process, tuple) else process)
@@ -114,7 +114,7 @@ def run(options):
         "inference": {"cycles": infer.most, "cycles_mean": infer.mean,
                       "cycles_net": sections[SECTION_INFER + "n"].most if SECTION_INFER + "n" in sections else None},
         "frame": {"cycles": frame.most, "cycles_mean": frame.mean},
-        "latency_ms": latency(latency_log), "counters": counters,
+        "latency_ms": latency(latency_log, hello, status), "counters": counters,
         "device": {key: calibrate.plain(getattr(status, key)) for key in
                    ("late_frames", "late_slots", "tx_dropped", "rx_bad", "rx_overrun", "saturated", "starved", "stack_free")},
         "notes": measured["notes"],
@@ -128,27 +128,34 @@ def model_crc(device):
     return 0 if info.active == lib.SG_SLOT_NONE else device.verify(info.active).crc
 
 
-def latency(path):
-    """From the virtual Nano's log, in ms of device time: mean sample time, and last sample, to the last byte's stop bit.
+def latency(path, hello, status):
+    """Mean sample time, and last sample, to the last byte's stop bit of the gaze frame; ms of device time.
 
-    The log's rows are cycle stamps; a frame's last byte is the last delimiter before the next frame's samples are all in.
+    path    the virtual Nano's log of cycles: first release of a sensing frame, its last sample read, delimiters sent
+    hello, status   of the device: frame period and exposures, which say when in a frame the samples were taken
+    Of a frame's two packets the gaze goes first, so its last byte is the first delimiter after the samples were read.
     """
     with open(path, newline="", encoding="ascii") as file:
         rows = [(row["event"], int(row["cycle"])) for row in csv.DictReader(file)]
-    last_sample = np.array([cycle for event, cycle in rows if event == "last_sample"])
-    first_release = np.array([cycle for event, cycle in rows if event == "first_release"])
-    sent = np.array([cycle for event, cycle in rows if event == "delimiter"])
-    to_last, to_mean = [], []
-    for begin, end in zip(last_sample[:-1], last_sample[1:]):
-        delimiters = sent[(sent > begin) & (sent <= end)]
-        releases = first_release[first_release < begin]
-        if len(delimiters) == 2 and len(releases):
-            to_last.append(delimiters[-1] - begin)
-            to_mean.append(delimiters[-1] - (releases[-1] + begin) / 2)
+    release, read, sent = (np.array([cycle for event, cycle in rows if event == name])
+                           for name in ("release", "sample", "delimiter"))
+    exposure = np.array(status.exposure_us_q2) / 4.0 * CPU_MHZ
+    slot = hello.frame_period_us / 6.0 * CPU_MHZ * np.arange(6)
+    last, mean = slot[-1] + exposure[-1], float(np.mean(slot + exposure / 2))
+    ends = []
+    for begin, end in zip(read[:-1], read[1:]):
+        packets = sent[(sent > begin) & (sent <= end)]
+        first = release[release < begin]
+        if len(packets) == 2 and len(first):        # a frame with both packets and nothing else on the line
+            ends.append(packets[0] - first[-1])
+    if not ends:
+        raise SparsegazeError("the virtual Nano logged no frame whose bytes could be told apart", "run the demo again")
     ms = 1e-3 / CPU_MHZ
-    return {"frames": len(to_last),
-            "mean_sample_to_last_byte": float(np.mean(to_mean)) * ms, "mean_sample_to_last_byte_max": float(np.max(to_mean)) * ms,
-            "last_sample_to_last_byte": float(np.mean(to_last)) * ms, "last_sample_to_last_byte_max": float(np.max(to_last)) * ms}
+    return {"frames": len(ends),
+            "mean_sample_to_last_byte": (np.mean(ends) - mean) * ms,
+            "mean_sample_to_last_byte_max": (np.max(ends) - mean) * ms,
+            "last_sample_to_last_byte": (np.mean(ends) - last) * ms,
+            "last_sample_to_last_byte_max": (np.max(ends) - last) * ms}
 
 
 def bars(report):
