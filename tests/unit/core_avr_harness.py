@@ -29,10 +29,10 @@ def run(command):
 
 
 def runner(directory):
-    """Build runner.c (libsimavr) into a directory; returns its path."""
+    """Have tools/vheadset build its bench runner into a directory; returns the program's path."""
     target = pathlib.Path(directory) / "runner"
     if not target.exists():
-        run(["gcc", "-std=gnu11", "-O2", HERE / "runner.c", "-o", target, "-lsimavr", "-lelf", "-lm"])
+        run(["make", "-s", "-C", ROOT / "tools" / "vheadset", f"BUILD={target.parent}", target])
     return target
 
 

@@ -25,7 +25,7 @@
 //     896   up to 64 until the ADC's prescaler turns, 13 ADC clocks
 //    9917   in all: 323 (20 us) to spare
 #include "port.h"
-#include "serial_ring.h"
+#include "port_serial.h"
 
 enum {
     LED_FIRST_ANODE = 2,            // anodes on PD2..PD7, cathodes on PC0..PC5

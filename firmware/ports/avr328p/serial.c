@@ -2,7 +2,7 @@
 // UART0 with a ring each way. At 1 Mbaud a byte takes 160 cycles and the receiver bridges two: the interrupts
 // are short.
 #include "port.h"
-#include "serial_ring.h"
+#include "port_serial.h"
 
 enum {
     TX_RING = 192,                      // a frame of all three streams (92), an answer (72), and some

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // The receiver's ring, and how a byte gets into it: by its interrupt (serial.c), or by one that knows it
 // takes long (sense.c). The receiver itself holds two bytes, 20 us at 1 Mbaud.
-#ifndef SERIAL_RING_H
-#define SERIAL_RING_H
+#ifndef PORT_SERIAL_H
+#define PORT_SERIAL_H
 
 #include <avr/io.h>
 #include <stdint.h>

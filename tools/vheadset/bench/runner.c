@@ -1,4 +1,4 @@
-// SPDX-License-Identifier: Apache-2.0
+// SPDX-License-Identifier: GPL-3.0-or-later
 // Run a bench ELF in simavr to its final sleep. Prints one line per marked section, "section k: count min
 // max" in net cycles (an empty pair of marks is 0), then the bytes it wrote to GPIOR1 as one line of hex.
 #include <stdio.h>
