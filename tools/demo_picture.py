@@ -32,10 +32,11 @@ def _targets(axis, validation):
     gaze = validation.run.gaze_deg[rows]
     axis.plot(gaze[:, 0], gaze[:, 1], ".", ms=1.2, alpha=0.25, color=BLUE, label="gaze, every valid frame")
     for row in validation.per_target():
-        axis.plot([row["target_az_deg"], row["gaze_az_deg"]], [row["target_el_deg"], row["gaze_el_deg"]], "-", color=RED, lw=1.2)
+        axis.plot([row["target_az_deg"], row["gaze_az_deg"]], [row["target_el_deg"], row["gaze_el_deg"]], "-", color=RED, lw=1.6)
     axis.plot(plan[:, 0], plan[:, 1], "k+", ms=10, mew=1.6, label="held-out target")
-    axis.set(title="Held-out targets", xlabel="azimuth (deg, + right)", ylabel="elevation (deg, + up)", aspect="equal")
-    axis.legend(fontsize=8, loc="upper right")
+    axis.set(title="Held-out targets", xlabel="azimuth (deg, + right)", ylabel="elevation (deg, + up)", aspect="equal",
+             xlim=(-24, 24), ylim=(-24, 30))
+    axis.legend(fontsize=8, loc="upper right", ncol=2, markerscale=2)
 
 
 def _errors(axis, report, validation):
@@ -74,7 +75,7 @@ def _trace(axis, validation):
         if validation.true_deg is not None:
             axis.plot(seconds[show], validation.true_deg[show, axis_index], color=RED, lw=0.7,
                       label="where the simulated eye looked" if axis_index else None)
-    axis.set(title="The first nine seconds", xlabel="device time (s)", ylabel="gaze (deg)", ylim=(-30, 30))
+    axis.set(title="The first nine seconds", xlabel="device time (s)", ylabel="gaze (deg)", ylim=(-30, 36))
     axis.legend(fontsize=8, loc="upper right", markerscale=5)
 
 
@@ -84,8 +85,8 @@ def _features(axis, calibration):
     azimuth = recording.target_deg[valid, 0]
     octaves = recording.features[valid] / 4096.0
     for i in range(octaves.shape[1]):
-        axis.plot(azimuth, octaves[:, i] - np.median(octaves[:, i]) + 0.8 * i, ".", ms=1, alpha=0.2)
-        axis.text(22.6, 0.8 * i, f"LED {i}", fontsize=9, va="center")
+        axis.plot(azimuth, octaves[:, i] - np.median(octaves[:, i]) + 0.8 * i, ".", ms=2.5, alpha=0.15)
+        axis.text(23.2, 0.8 * i, f"LED {i}", fontsize=9, va="center")
     axis.set(title="The six signals, calibration frames", xlabel="target azimuth (deg)",
              ylabel="log2 photocurrent about its median (octaves, spread by 0.8)", xlim=(-23, 27))
 
@@ -104,6 +105,7 @@ def _numbers(axis, report):
         ("bit-identical with the host core", "yes" if stream["bit_identical"] else "NO"),
         ("calibration vectors on the device", f"{report['model']['n_vectors']}"),
         ("inference, worst", f"{report['inference']['cycles']:.0f} cycles"),
+        ("all work on a frame, worst", f"{report['frame']['cycles']:.0f} of {report['frame']['period_cycles']:.0f} cycles"),
         ("mean sample to last byte", f"{delay['mean_sample_to_last_byte']:.2f} ms"),
         ("last sample to last byte", f"{delay['last_sample_to_last_byte']:.2f} ms"),
         ("flash written and verified", f"{report['flash']['bytes']} bytes"),
