@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # The one entry point; CI runs `make test`. `make` alone lists what there is.
 #
-#   SEED=k       the simulated person, parts and noise of `make demo`
+#   SEED=k       the simulated person, parts and noise of `make demo`; SEEDS="..." those of `make seeds`
 #   ARGS="..."   handed on: to tools/demo.py by `make demo`, to pytest by `make test`
 #   PYTHON=...   the interpreter that .venv is made with
 
@@ -11,6 +11,7 @@ SHELL := /bin/sh
 .NOTPARALLEL:
 
 SEED ?= 1
+SEEDS ?= 1 2 3 4 5 6 7 8 9 10
 ARGS ?=
 PY := .venv/bin/python
 SDK := host_sdk/sparsegaze
@@ -24,7 +25,7 @@ quietly = echo "$(1)"; { $(1); } >build/native/log 2>&1 || { cat build/native/lo
 # $(1) over $(2) when it differs, at one stroke because somebody may be reading; then the command $(3).
 refresh = cmp -s $(1) $(2) || { cp $(1) $(2).new && mv $(2).new $(2) && $(if $(3),$(3),:); }
 
-.PHONY: help setup firmware native demo test check size lock clean distclean
+.PHONY: help setup firmware native demo seeds test check size lock clean distclean
 
 help: ## this list
 	@sed -n 's/^\([a-z]*\):[^#]*## \(.*\)/  make \1#\2/p' $(MAKEFILE_LIST) | \
@@ -57,6 +58,9 @@ build/native/sim: $(wildcard sim_c/*.[ch] $(SDK)/_sim_build.py) .venv/setup-stam
 
 demo: setup firmware native ## the whole main job on a virtual Nano; SEED=k draws another person
 	@$(PY) tools/demo.py --seed $(SEED) --started $(STARTED) $(ARGS)
+
+seeds: setup firmware native ## the demo on many persons: make seeds SEEDS="1 2 3"
+	@$(PY) tools/seeds.py $(SEEDS)
 
 test: setup firmware native ## every test; ARGS="-k name" for some
 	@$(PY) -m pytest $(ARGS)
