@@ -14,7 +14,7 @@ USED, SETTLING, FLAGGED, BLINK, UNSTABLE, INATTENTIVE, OUTSIDE = range(7)
 REASONS = ("used", "settling", "flagged", "blink", "unstable", "inattentive", "outside")
 
 OCTAVE = 4096.0
-LAG_FRAMES = 4  # a lid closes within 50..80 ms = 14..22 frames of 3.6 ms; noise averages over such a lag
+LAG_FRAMES = 4  # a lid closes within 50..80 ms = 13..21 frames of 3.84 ms; noise averages over such a lag
 PAD_FRAMES = 6  # lids move slowly before and after the part that a derivative shows
 JUMP_FLOOR = 0.012 * OCTAVE  # steps smaller than this are fixational movement, whatever the noise
 LEVEL_FLOOR = 0.020 * OCTAVE

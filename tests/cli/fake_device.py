@@ -15,7 +15,7 @@ from sparsegaze.errors import DisconnectedError
 from sparsegaze.model import DeviceModel
 from sparsegaze.wire import Gaze, Raw, Recentre, lib
 
-FRAME_US = 3600
+FRAME_US = 3840
 OPTICS = np.array(
     [[60, 10], [-55, 20], [15, -70], [-20, 60], [45, 45], [-40, -40]], float
 )  # feature steps per degree

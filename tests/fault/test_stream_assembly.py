@@ -10,7 +10,7 @@ from sparsegaze.device import Frame
 from sparsegaze.stream import Assembler
 from sparsegaze.wire import lib
 
-PERIOD_US = 3600
+PERIOD_US = 3840
 
 
 def packet(kind, seq, t_us):
