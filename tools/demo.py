@@ -19,11 +19,16 @@ from demo_picture import draw
 from sparsegaze import calibrate, flash, targets, validate
 from sparsegaze.device import Device
 from sparsegaze.errors import SparsegazeError
+from sparsegaze.headset import load_headset
+from sparsegaze.mapplot import save_maps
+from sparsegaze.person import draw_person
 from sparsegaze.screen import screen_for
+from sparsegaze.simulate import response_map
 from sparsegaze.transport import open_link
 from sparsegaze.virtual import VirtualNano
 from sparsegaze.wire import lib
 
+HEADSET = Path(__file__).resolve().parent.parent / "headsets" / "led2gaze.toml"
 CPU_MHZ = 16.0
 FRESH_S, READY_S = 600.0, 240.0     # whole run on a fresh clone, and when set up
 SET_UP_S = 30.0                     # a set-up that took longer than this had something to install or build
@@ -49,13 +54,15 @@ def main():
         return 1
     report["setup_s"] = round(setup_s, 2)
     draw(options.out / "demo.png", report, calibration, validation)
+    headset = load_headset(HEADSET)
+    save_maps(response_map(headset, draw_person(options.seed)), headset, options.out / "map.png")
     report["total_s"] = round(time.time() - started, 2)
     report["bars"] = bars(report)
     (options.out / "report.json").write_text(json.dumps(calibrate.plain(report), indent=1) + "\n", encoding="utf-8")
     missed = [bar for bar in report["bars"] if not bar["met"]]
     for bar in report["bars"]:
         print(f"  {'ok  ' if bar['met'] else 'MISS'} {bar['name']:32} {bar['value']!s:>22}   bar {bar['bar']}")
-    print(f"{options.out}/report.json, gaze.csv and demo.png written: simulated person {options.seed}, "
+    print(f"{options.out}/report.json, gaze.csv, demo.png and map.png written: simulated person {options.seed}, "
           f"mean error {report['accuracy']['mean_deg']:.2f} deg at {report['stream']['rate_hz']:.0f} Hz")
     for bar in missed:
         print(f"demo: bar missed: {bar['name']} is {bar['value']}, needs {bar['bar']}", file=sys.stderr)
@@ -103,7 +110,7 @@ def run(options):
     infer, frame = sections[SECTION_INFER], sections[SECTION_FRAME]
     model = calibration.fit.model
     report = {
-        "simulated": True, "seed": seed, "headset": "headsets/led2gaze.toml", "map_s": round(map_s, 2),
+        "simulated": True, "seed": seed, "headset": f"headsets/{HEADSET.name}", "map_s": round(map_s, 2),
         "flash": {"bytes": flashed.bytes, "verified": flashed.verified, "seconds": round(flashed.seconds, 3),
                   "bootloader": flashed.bootloader, "baud": flashed.baud},
         "calibration": {"targets": options.targets, "seconds": round(calibration_s, 2),
