@@ -19,6 +19,7 @@ HEX := $(SDK)/data/firmware.hex
 PIO := .pio/build/nano
 BINUTILS := .pio-offline/packages/toolchain-atmelavr/bin
 STARTED := $(shell date +%s.%N)
+FRESH := $(if $(wildcard .venv/setup-stamp),,--fresh)
 
 # The command $(1), which speaks only when it fails.
 quietly = echo "$(1)"; { $(1); } >build/native/log 2>&1 || { cat build/native/log >&2; exit 1; }
@@ -57,7 +58,7 @@ build/native/sim: $(wildcard sim_c/*.[ch] $(SDK)/_sim_build.py) .venv/setup-stam
 .venv/setup-stamp: | setup
 
 demo: setup firmware native ## the whole main job on a virtual Nano; SEED=k draws another person
-	@$(PY) tools/demo.py --seed $(SEED) --started $(STARTED) $(ARGS)
+	@$(PY) tools/demo.py --seed $(SEED) --started $(STARTED) $(FRESH) $(ARGS)
 
 seeds: setup firmware native ## the demo on many persons: make seeds SEEDS="1 2 3"
 	@$(PY) tools/seeds.py $(SEEDS)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from demo_picture import draw
-from sparsegaze import calibrate, flash, targets, validate
+from sparsegaze import calibrate, flash, metrics, targets, validate
 from sparsegaze.device import Device
 from sparsegaze.errors import SparsegazeError
 from sparsegaze.headset import load_headset
@@ -30,9 +30,10 @@ from sparsegaze.wire import lib
 
 HEADSET = Path(__file__).resolve().parent.parent / "headsets" / "led2gaze.toml"
 CPU_MHZ = 16.0
-FRESH_S, READY_S = 600.0, 240.0     # whole run on a fresh clone, and when set up
-SET_UP_S = 30.0                     # a set-up that took longer than this had something to install or build
+FRESH_S, READY_S = 600.0, 240.0     # bars: whole run on a fresh clone, and when set up
+LOSS_MOST = 0.2                     # bar: blinks alone cost about 0.09 (15 a minute, 0.24 s and the hold after each)
 TARGETS, HELD_OUT = 120, 25
+RESULTS = ("report.json", "demo.png", "map.png", "gaze.csv", "latency.csv", "recording.csv", "model.sgm")
 SECTION_INFER, SECTION_FRAME = "0", "5"     # GPIOR0 sections of the firmware: inference, and all work on a frame
 
 
@@ -44,15 +45,18 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("build/demo"), help="folder of the results (default build/demo)")
     parser.add_argument("--targets", type=int, default=TARGETS, help=f"calibration targets (default {TARGETS})")
     parser.add_argument("--held-out", type=int, default=HELD_OUT, help=f"validation targets (default {HELD_OUT})")
+    parser.add_argument("--fresh", action="store_true", help="nothing was set up when `make demo` began")
     options = parser.parse_args()
     started = time.time() if options.started is None else options.started
     setup_s = time.time() - started
+    for name in RESULTS:            # those of an earlier run must not pass for this one's
+        (options.out / name).unlink(missing_ok=True)
     try:
         report, calibration, validation = run(options)
     except SparsegazeError as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1
-    report["setup_s"] = round(setup_s, 2)
+    report["setup_s"], report["fresh"] = round(setup_s, 2), options.fresh
     draw(options.out / "demo.png", report, calibration, validation)
     headset = load_headset(HEADSET)
     save_maps(response_map(headset, draw_person(options.seed)), headset, options.out / "map.png")
@@ -107,6 +111,9 @@ def run(options):
     gp_deg = np.asarray(process[0] if isinstance(process, tuple) else process)
     accuracy = dict(measured["accuracy"], gp64_mean_deg=validation.error_of(gp_deg).mean_deg)
     accuracy["data_loss"] = accuracy.pop("data_loss_percent") / 100.0
+    accuracy.update(with_held_frames(validation))
+    inside = validation.run.target_index >= 0
+    measured["stream"]["wall_seconds"] = float(np.ptp(validation.run.frames["host_s"][inside]))
     infer, frame = sections[SECTION_INFER], sections[SECTION_FRAME]
     model = calibration.fit.model
     report = {
@@ -129,6 +136,17 @@ def run(options):
         "notes": measured["notes"],
     }
     return report, calibration, validation
+
+
+def with_held_frames(validation):
+    """The mean error as it would be without the hold after a blink (SG_FLAG_RECOVERING): what that flag is worth."""
+    refused = lib.SG_FLAG_NO_MODEL | lib.SG_FLAG_OUT_OF_RANGE | lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED
+    frames = validation.run.frames
+    rows = validation.settled & frames["has_gaze"] & ((frames["gaze_flags"] & refused) == 0)
+    gaze, target = validation.run.gaze_deg[rows], validation.run.target_deg[rows]
+    error = metrics.frame_error(gaze[:, 0], gaze[:, 1], target[:, 0], target[:, 1])
+    return {"mean_without_hold_deg": error.mean_deg,
+            "data_loss_without_hold": 1.0 - error.frames / max(1, int(validation.settled.sum()))}
 
 
 def model_crc(device):
@@ -170,7 +188,7 @@ def latency(path, hello, status):
 def bars(report):
     """The bars of the demo: [{name, value, bar, met}]."""
     stream, accuracy, model = report["stream"], report["accuracy"], report["model"]
-    limit = FRESH_S if report["setup_s"] > SET_UP_S else READY_S
+    limit = FRESH_S if report["fresh"] else READY_S
     gap = abs(accuracy["mean_deg"] - accuracy["gp64_mean_deg"])
     rows = [
         ("total_s", report["total_s"], f"<= {limit:.0f}", report["total_s"] <= limit),
@@ -178,11 +196,13 @@ def bars(report):
         ("model.n_vectors", model["n_vectors"], ">= 64", model["n_vectors"] >= 64),
         ("model.crc_device", model["crc_device"], f"= {model['crc_host']} after a power cycle",
          model["crc_device"] == model["crc_host"] == model["crc_before"]),
-        ("stream.seconds", round(stream["seconds"], 2), ">= 20", stream["seconds"] >= 20),
+        ("stream.seconds", round(stream["seconds"], 2), ">= 20, in real time",
+         stream["seconds"] >= 20 and abs(stream["wall_seconds"] / stream["seconds"] - 1) < 0.05),
         ("stream.rate_hz", round(stream["rate_hz"], 2), ">= 250", stream["rate_hz"] >= 250),
         ("stream.lost", stream["lost"] + stream["torn"], "0", stream["lost"] + stream["torn"] == 0),
         ("stream.bit_identical", stream["bit_identical"], "true", stream["bit_identical"] is True),
         ("accuracy.mean_deg", round(accuracy["mean_deg"], 3), "<= 1.0", accuracy["mean_deg"] <= 1.0),
+        ("accuracy.data_loss", round(accuracy["data_loss"], 3), f"<= {LOSS_MOST}", accuracy["data_loss"] <= LOSS_MOST),
         ("|mean_deg - gp64_mean_deg|", round(gap, 4), "<= 0.05", gap <= 0.05),
     ]
     return [{"name": name, "value": value, "bar": bar, "met": bool(met)} for name, value, bar, met in rows]
