@@ -16,6 +16,10 @@ import numpy as np
 from .errors import SceneError
 
 
+# Part of the gaze's elevation that the upper lid's margin follows: [eye].lid_follow_gain of physics.toml.
+LID_FOLLOW_GAIN = 0.9
+
+
 @dataclass(frozen=True)
 class Person:
     """The defaults are the nominal person."""
@@ -38,7 +42,7 @@ class Person:
     lid_lower_deg: float = -27.0
     canthus_deg: float = 66.0
     canthus_tilt_deg: float = 3.0
-    lid_upper_follow: float = 0.9
+    lid_upper_follow: float = LID_FOLLOW_GAIN
     lid_lower_follow: float = 0.5
     lid_close_at: float = 0.12
     lid_thickness_mm: float = 1.6
@@ -91,10 +95,21 @@ _CORRELATED = {
 _SEAT_SD_MM = 1.0  # how differently a headset sits on different people, per axis
 
 
-def draw_person(seed):
-    """A person from a seed (a non-negative integer): the same seed is always the same person."""
+def nominal_person(lid_follow_gain=LID_FOLLOW_GAIN):
+    """The person whose every number is the population's mean, wearing the headset centred."""
+    return Person(lid_upper_follow=float(lid_follow_gain))
+
+
+def draw_person(seed, lid_follow_gain=LID_FOLLOW_GAIN):
+    """A person from a seed (a non-negative integer): the same seed is always the same person.
+
+    lid_follow_gain    part of the gaze's elevation, 0..2, that the upper lid follows; nobody's draw depends
+                       on it. SceneError when seed or gain is impossible.
+    """
     if isinstance(seed, bool) or int(seed) != seed or seed < 0:
         raise SceneError("a person's seed is a whole number, 0 or more, not %r" % (seed,), "for example 7")
+    if not 0.0 <= lid_follow_gain <= 2.0:
+        raise SceneError("the lids' gain is %r" % (lid_follow_gain,), "0 to 2; 0.9 is a person's")
     rng = np.random.default_rng([int(seed), 0x5A2E])
     names = list(_SPREAD)
     correlation = np.eye(len(names))
@@ -102,7 +117,8 @@ def draw_person(seed):
         i, j = names.index(a), names.index(b)
         correlation[i, j] = correlation[j, i] = value
     draw = np.linalg.cholesky(correlation) @ rng.standard_normal(len(names))
-    nominal, values = Person(), {}
+    nominal = nominal_person(lid_follow_gain)
+    values = {"lid_upper_follow": nominal.lid_upper_follow}
     for name, z in zip(names, draw):
         sd, low, high = _SPREAD[name]
         values[name] = float(np.clip(getattr(nominal, name) + sd * z, low, high))

@@ -34,6 +34,13 @@ PUPIL_NODES_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 LID_NODES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 PUPIL_NOMINAL_MM = 3.5
 
+# sim_map_mean() of headsets/led2gaze.toml on nominal_person(): the unit of light. physics.toml's
+# [photocurrent] gives the current of exactly this mean (nominal_na = 200 nA), so that a map of any other
+# headset or person stands for nominal_na * its own mean / REFERENCE_MEAN: darker skin, a deeper seat or a
+# dim placement collect less. Depends on the default headset and on the simulator's optics only; a test
+# computes it again.
+REFERENCE_MEAN = 8.1212e-6
+
 STATE_FIELDS = (
     "azimuth_deg",
     "elevation_deg",

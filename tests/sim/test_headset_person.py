@@ -9,7 +9,7 @@ from sim_scenes import pair, port
 
 from sparsegaze.errors import SceneError
 from sparsegaze.headset import load_headset
-from sparsegaze.person import Person, draw_person, load_person
+from sparsegaze.person import LID_FOLLOW_GAIN, Person, draw_person, load_person, nominal_person, read_toml
 from sparsegaze.scene import Scene
 
 LED = """
@@ -201,3 +201,20 @@ def test_a_person_file_gives_what_it_says_and_the_rest_is_nominal(tmp_path):
 def test_a_malformed_person_file_is_refused(tmp_path, text):
     with pytest.raises(SceneError):
         load_person(write(tmp_path, text))
+
+
+def test_lids_follow_by_the_gain_that_the_virtual_nanos_physics_states(repo_root):
+    stated = read_toml(repo_root / "tools" / "vheadset" / "physics.toml")["eye"]["lid_follow_gain"]
+    assert LID_FOLLOW_GAIN == stated
+    assert nominal_person().lid_upper_follow == draw_person(3).lid_upper_follow == stated
+
+
+def test_another_lid_gain_changes_nothing_else_of_a_drawn_person():
+    assert draw_person(3, 0.5) == replace(draw_person(3), lid_upper_follow=0.5)
+    assert nominal_person(0.5) == replace(Person(), lid_upper_follow=0.5)
+
+
+@pytest.mark.parametrize("gain", [-0.1, 2.1, float("nan")])
+def test_a_lid_gain_that_nobody_has_is_refused(gain):
+    with pytest.raises(SceneError):
+        draw_person(3, gain)
