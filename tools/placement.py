@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """How well a placement of LEDs tells gaze, over simulated people; and a search for a better one.
 
-    python tools/placement.py [HEADSET] [--persons 20] [--json FILE]
+    python tools/placement.py [HEADSET] [--persons 20] [--first 0] [--json FILE]
     python tools/placement.py HEADSET --search 600 [--seed 1] -o BETTER.json
 
 Two figures per person, both from the simulator directly (no map, no virtual Nano):
 
 precision   what a perfect estimator would reach on one frame: square root of the trace of the inverse Fisher
-            information of gaze, given 0.45 % rms noise per channel and a pupil that wanders by 0.33 mm rms,
-            averaged over a grid within +-20 degrees;
+            information of gaze, given the noise of each channel's light and a pupil that wanders by 0.33 mm
+            rms, averaged over a grid within +-20 degrees;
 learned     what the product's Gaussian process reaches after its 120 calibration fixations, each 0.3
             degrees off per axis (fixation bias) and with another pupil, on single noisy frames of 49 held-out
             targets within +-20 degrees: mean angle to the target, and to where the simulated eye looked.
@@ -17,6 +17,15 @@ learned     what the product's Gaussian process reaches after its 120 calibratio
 The search moves one LED's aim at a time (where LEDs sit is the case's choice) and keeps what lowers the
 learned error of the mean and of the worst of a few people. The glints' rings are what it mostly avoids: a
 placement with the best precision can be twice as hard to learn.
+
+Noise is the light's: a response is a photocurrent of 200 nA times its ratio to REFERENCE_MEAN, so a placement
+or a person that returns little light pays for it (`noise`).
+
+The search may only see persons from 1000 on. Nobody draws those by default, so that what is reported of
+persons 0, 1, 2, ... was never tuned on; the tool refuses to judge whom it searched on. The aims in
+headsets/led2gaze.toml are older than this rule: they were searched on persons 12, 10, 0 and 3, with 0.45 %
+noise whatever the light, and judged on persons 0..19, which contain those four. Judge with --first 2000 for
+figures of people whom no search has seen.
 """
 
 import argparse
@@ -35,9 +44,17 @@ from sparsegaze.gp import GaussianProcess  # noqa: E402
 from sparsegaze.headset import Headset, load_headset  # noqa: E402
 from sparsegaze.person import draw_person  # noqa: E402
 from sparsegaze.scene import Scene  # noqa: E402
+from sparsegaze.simulate import REFERENCE_MEAN  # noqa: E402
 from sparsegaze.targets import calibration_plan, validation_plan  # noqa: E402
 
-NOISE = 0.0045  # of one frame, relative
+NOMINAL_NA = 200.0  # photocurrent of REFERENCE_MEAN: [photocurrent].nominal_na of physics.toml
+# Relative noise of one frame, measured on the virtual Nano with the firmware's four readings per sample, no
+# ambient light, eye at rest: 0.30 % rms at 200 nA, 0.77 % at 75 nA, about 0.2 % in strong light. Below 200 nA
+# the exposure is at its cap, so that less light is a smaller step of the same converter. The model: a power
+# through the first two readings, almost 1 / I, never below the third.
+NOISE_NOMINAL, NOISE_POWER, NOISE_FLOOR = 0.0030, 0.96, 0.0020
+FIRST_SEARCHED = 1000  # the search sees nobody below this
+SEARCHED = (1000, 1001, 1002, 1003)
 PUPIL_MM, PUPIL_BETWEEN_MM, PUPIL_WITHIN_MM = 3.5, 0.8, 0.33
 BIAS_DEG = 0.3
 FRAMES_PER_FIXATION = 40
@@ -60,6 +77,12 @@ def channels(response):
     return response.sum(-1)
 
 
+def noise(signal):
+    """Relative rms noise of one frame in channels of this response (any shape; response units, > 0)."""
+    current = NOMINAL_NA * np.asarray(signal) / REFERENCE_MEAN
+    return np.maximum(NOISE_NOMINAL * (NOMINAL_NA / current) ** NOISE_POWER, NOISE_FLOOR)
+
+
 def precision_deg(scene, step_deg=5.0, half_deg=20.0):
     """Radial rms of the best possible estimate of gaze from one frame, averaged over a grid."""
     grid, h, errors = np.arange(-half_deg, half_deg + 0.1, step_deg), 0.5, []
@@ -70,7 +93,7 @@ def precision_deg(scene, step_deg=5.0, half_deg=20.0):
                 return np.log(channels(scene.response(azimuth + d_az, elevation + d_el, PUPIL_MM + d_pupil)))
 
             slopes = [(at(*(h * e)) - at(*(-h * e))) / (2 * h) for e in np.eye(3)]
-            slopes = np.array(slopes) / NOISE
+            slopes = np.array(slopes) / noise(np.exp(at(0, 0, 0)))
             information = slopes @ slopes.T
             information[2, 2] += 1 / PUPIL_WITHIN_MM**2
             errors.append(np.sqrt(np.trace(np.linalg.inv(information)[:2, :2])))
@@ -82,20 +105,21 @@ def learned_deg(scene, seed, n_validation=25):
     rng = np.random.default_rng([seed, 0x91ACE])
     pupil = float(np.clip(PUPIL_MM + PUPIL_BETWEEN_MM * rng.normal(), 2.4, 5.5))
 
-    def look(targets, noise):
+    def look(targets, frames):
         true = targets + rng.normal(0, BIAS_DEG, targets.shape)
         signal = np.array(
             [channels(scene.response(az, el, pupil + PUPIL_WITHIN_MM * rng.normal())) for az, el in true]
         )
-        return FEATURE_STEPS * np.log2(signal * (1 + noise * rng.normal(size=signal.shape))), true
+        error = noise(signal) / np.sqrt(frames) * rng.normal(size=signal.shape)
+        return FEATURE_STEPS * np.log2(signal * (1 + error)), true
 
     plan, held_out = calibration_plan(120, seed).target_deg, validation_plan(n_validation, seed).target_deg
-    features, _ = look(plan, NOISE / np.sqrt(FRAMES_PER_FIXATION))
+    features, _ = look(plan, FRAMES_PER_FIXATION)
     origin = features.mean(0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         process = GaussianProcess.fit(features - origin, plan, mean="linear", restarts=1)
-    tests, true = look(held_out, NOISE)
+    tests, true = look(held_out, 1)
     predicted = np.asarray(process.predict(tests - origin))
     to_true = np.hypot(*(predicted - true).T)
     return (
@@ -105,12 +129,24 @@ def learned_deg(scene, seed, n_validation=25):
     )
 
 
+def light_na(scene, step_deg=5.0, half_deg=20.0):
+    """Photocurrent of each sensor, nominal pupil, nA: mean over a grid of gaze (with this step, 2 % above the
+    mean over a map's finer one).
+    """
+    grid = np.arange(-half_deg, half_deg + 0.1, step_deg)
+    seen = [channels(scene.response(azimuth, elevation, PUPIL_MM)) for azimuth in grid for elevation in grid]
+    return NOMINAL_NA * np.mean(seen, axis=0) / REFERENCE_MEAN
+
+
 def judge(headset, persons):
-    """One row of figures per person."""
+    """One row of figures per person. ValueError when the search has seen one of them."""
+    if set(persons) & set(SEARCHED):
+        raise ValueError("persons %s are searched on, not judged" % sorted(set(persons) & set(SEARCHED)))
     rows = []
     for seed in persons:
         scene = Scene(headset, draw_person(seed), quality=QUICK)
         target, true, p95 = learned_deg(scene, seed, 49)
+        light = light_na(scene)
         rows.append(
             {
                 "person": seed,
@@ -118,10 +154,13 @@ def judge(headset, persons):
                 "learned_to_target_deg": target,
                 "learned_to_true_gaze_deg": true,
                 "learned_p95_deg": p95,
+                "light_na": float(light.mean()),
+                "darkest_channel_na": float(light.min()),
             }
         )
         print(
-            "person %2d: precision %.3f deg, learned %.2f deg to target, %.2f to true gaze (p95 %.2f)"
+            "person %2d: precision %.3f deg, learned %.2f deg to target, %.2f to true gaze (p95 %.2f), "
+            "%.0f nA, darkest channel %.0f nA"
             % tuple(rows[-1].values()),
             flush=True,
         )
@@ -143,8 +182,13 @@ def aim_point(port, z_mm=-11.0):
     return np.array(port.position_mm) + reach * np.array(port.aim)
 
 
-def search(headset, seconds, seed, persons=(12, 10, 0, 3)):
-    """Hill climbing over aims; the best headset found. Headsets of LEDs (sensors = emitters) only."""
+def search(headset, seconds, seed, persons=SEARCHED):
+    """Hill climbing over aims; the best headset found. Headsets of LEDs (sensors = emitters) only.
+
+    ValueError when a person is one that reports are about.
+    """
+    if min(persons) < FIRST_SEARCHED:
+        raise ValueError("the search sees persons from %d on only" % FIRST_SEARCHED)
 
     def cost(candidate, give_up=np.inf):
         errors = []
@@ -174,7 +218,8 @@ def main():
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("headset", nargs="?", default=os.path.join(root, "headsets", "led2gaze.toml"))
-    parser.add_argument("--persons", type=int, default=20, help="judge on persons 0..N-1")
+    parser.add_argument("--persons", type=int, default=20, help="judge on this many persons")
+    parser.add_argument("--first", type=int, default=0, help="the first of them")
     parser.add_argument("--json", help="write the figures here")
     parser.add_argument(
         "--search", type=float, default=0.0, metavar="SECONDS", help="look for better aims first"
@@ -182,6 +227,9 @@ def main():
     parser.add_argument("--seed", type=int, default=1, help="of the search")
     parser.add_argument("-o", "--output", help="write the aims found here (JSON)")
     options = parser.parse_args()
+    judged = range(options.first, options.first + options.persons)
+    if set(judged) & set(SEARCHED):
+        parser.error("persons %d..%d are for the search" % (min(SEARCHED), max(SEARCHED)))
     headset = load_headset(options.headset)
     if options.search > 0:
         headset = search(headset, options.search, options.seed)
@@ -190,12 +238,12 @@ def main():
         if options.output:
             with open(options.output, "w", encoding="utf-8") as file:
                 json.dump({"aim_mm": aims}, file)
-    rows = judge(headset, range(options.persons))
-    summary = {
-        key: {"mean": float(np.mean([r[key] for r in rows])), "worst": float(np.max([r[key] for r in rows]))}
-        for key in rows[0]
-        if key != "person"
-    }
+    rows = judge(headset, judged)
+    summary = {}
+    for key in rows[0]:
+        values = [row[key] for row in rows]
+        if key != "person":
+            summary[key] = {"mean": float(np.mean(values)), "least": min(values), "most": max(values)}
     print(json.dumps(summary, indent=1))
     if options.json:
         with open(options.json, "w", encoding="utf-8") as file:

@@ -3,12 +3,13 @@
 
 import os
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from sim_scenes import six
 
-from sparsegaze.person import draw_person
+from sparsegaze.person import draw_person, nominal_person
 from sparsegaze.scene import Scene
 from sparsegaze.simulate import Grid, response_map
 
@@ -33,6 +34,50 @@ def test_the_hardest_of_twenty_people_is_learnt_within_the_bar(placement, led2ga
     scene = Scene(led2gaze, draw_person(0), quality=placement.QUICK)
     to_target, to_true, _ = placement.learned_deg(scene, 0, 49)
     assert to_target < 0.95 and to_true < 0.8
+
+
+def test_noise_is_the_measured_one_at_nominal_and_dim_light_and_has_a_floor(placement):
+    from sparsegaze.simulate import REFERENCE_MEAN
+
+    noise = placement.noise(REFERENCE_MEAN * np.array([200.0, 75.0, 20.0, 400.0, 4000.0]) / 200.0)
+    np.testing.assert_allclose(noise[:2], (0.0030, 0.0077), rtol=0.01)
+    assert noise[2] > 0.025
+    np.testing.assert_allclose(noise[3:], 0.0020)
+
+
+def test_the_same_eye_with_darker_tissue_tells_less(placement, led2gaze):
+    bright = nominal_person()
+    dark = replace(
+        bright,
+        albedo_sclera=bright.albedo_sclera / 2,
+        albedo_iris=bright.albedo_iris / 2,
+        albedo_skin=bright.albedo_skin / 2,
+    )
+    scenes = [Scene(led2gaze, person, quality=placement.QUICK) for person in (bright, dark)]
+    light = [placement.light_na(scene, step_deg=20.0).mean() for scene in scenes]
+    assert light[1] < 0.6 * light[0]
+    error = [placement.precision_deg(scene, step_deg=20.0) for scene in scenes]
+    assert error[1] > 1.4 * error[0]
+
+
+def test_light_is_counted_from_the_reference(placement, led2gaze):
+    scene = Scene(led2gaze, nominal_person(), quality=placement.QUICK)
+    assert placement.light_na(scene).mean() == pytest.approx(200.0, rel=0.03)
+
+
+def test_the_search_refuses_people_whom_reports_are_about(placement, led2gaze):
+    with pytest.raises(ValueError, match="1000"):
+        placement.search(led2gaze, 0.0, 1, persons=(1000, 999))
+
+
+def test_nobody_searched_on_is_judged(placement, led2gaze, monkeypatch, capsys):
+    assert min(placement.SEARCHED) >= placement.FIRST_SEARCHED
+    with pytest.raises(ValueError, match="searched"):
+        placement.judge(led2gaze, range(990, 1001))
+    monkeypatch.setattr(sys, "argv", ["placement.py", "--first", "990"])
+    with pytest.raises(SystemExit):
+        placement.main()
+    assert "for the search" in capsys.readouterr().err
 
 
 def test_wider_windows_tell_less(placement, led2gaze):
