@@ -29,6 +29,21 @@ def random_model(vectors, seed=0, generation=1, channels=CHANNELS):
         guards=[(-2**18, 2**18, rng.integers(-60, 60, channels)) for _ in range(3)])
 
 
+def costly_model(middle, vectors=64, seed=0):
+    """The ordinary model that costs most: six guards, as the distiller writes, and no kernel that ends early.
+
+    middle    [6] features in the middle of its box; the box is 8190 feature steps wide in every channel
+    Its centres lie in the middle fifth of the box, so that no kernel is zero for features within 1000 steps of
+    the middle, and every guard passes there, so that all are computed.
+    """
+    rng = np.random.default_rng(seed)
+    return DeviceModel.from_parts(
+        offset=np.asarray(middle, int) - 4095, gain_q12=np.full(CHANNELS, 2048),
+        bias=rng.integers(-2**28, 2**28, 2), trend=rng.integers(-2**15, 2**15, (2, CHANNELS)),
+        centres=rng.integers(102, 154, (vectors, CHANNELS)), weights=rng.integers(-30000, 30000, (vectors, 2)),
+        weight_frac_bits=8, guards=[(-2**30, 2**30, rng.integers(-127, 128, CHANNELS)) for _ in range(CHANNELS)])
+
+
 def random_features(n, seed=0):
     """[n, 6] features: most inside the span of random_model, some at its edges, some anywhere."""
     rng = np.random.default_rng(seed)
