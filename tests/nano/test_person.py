@@ -9,7 +9,10 @@ from board import Board, firmware
 
 
 def truth(seed=1, seconds=1.0, targets=(), commands=(), **keys):
-    """Rows (us, az, el, pupil, lid, target az, target el) of a run."""
+    """Rows (us, az, el, pupil, lid, target az, target el) of a run.
+
+    `commands` may begin with "power off": the person lives on, and much faster without the chip.
+    """
     with Board(app=firmware("echo"), seed=seed, **keys) as board:
         path = board.folder / "truth.csv"
         board.command(f"truth {path}")
@@ -23,6 +26,7 @@ def truth(seed=1, seconds=1.0, targets=(), commands=(), **keys):
 
 
 def rms(values):
+    """About the mean."""
     mean = sum(values) / len(values)
     return math.sqrt(sum((v - mean) ** 2 for v in values) / len(values))
 
@@ -62,20 +66,79 @@ def test_fixation_bias_is_per_target_and_of_the_stated_size():
     for at, az, el in targets:
         part = [row for row in rows if at + 400000 <= row[0] < at + 600000]
         bias += [sum(r[1] for r in part) / len(part) - az, sum(r[2] for r in part) / len(part) - el]
-    size = math.sqrt(sum(b * b for b in bias) / len(bias))
-    assert 0.25 < size < 0.42                                           # 0.3, drift and microsaccades on top
+    assert 0.25 < size(bias) < 0.42                                     # 0.3, drift and microsaccades on top
 
 
-def test_drift_microsaccades_pupil_and_blinks_over_two_minutes():
-    rows = truth(2, 120.0)
+def size(values):
+    """Root mean square about zero, not about the mean."""
+    return math.sqrt(sum(v * v for v in values) / len(values))
+
+
+def autocorrelation(seconds, time_s):
+    """Of noise through two equal first-order stages."""
+    return (1 + seconds / time_s) * math.exp(-seconds / time_s)
+
+
+PUPIL_RMS_MM = math.hypot(0.3, 0.15)                                    # slow drift and hippus: physics.toml
+
+
+def test_pupil_is_as_far_from_its_mean_at_the_start_as_ever_after_in_200_seeds():
+    first, later, change = [], [], []
+    for seed in range(200):
+        rows = truth(seed, 8.0, commands=["power off"], pupil_mean_mm=4.25)
+        first.append(rows[0][3] - 4.25)
+        later.append(rows[8000][3] - 4.25)
+        change += [rows[k + 1000][3] - rows[k][3] for k in range(0, 7000, 1000)]
+    assert size(first) == pytest.approx(PUPIL_RMS_MM, rel=0.1)
+    assert size(later) == pytest.approx(PUPIL_RMS_MM, rel=0.1)
+    # Within a second it is hippus that moves: both parts have their own size, not only their sum.
+    expected = math.sqrt(2 * 0.15 ** 2 * (1 - autocorrelation(1, 0.25))
+                         + 2 * 0.3 ** 2 * (1 - autocorrelation(1, 10)))
+    assert size(change) == pytest.approx(expected, rel=0.1)
+
+
+def windows(rows, axis, length=500):
+    """Deviations from its own mean within each half second."""
+    for start in range(0, len(rows) - length + 1, length):
+        part = [row[axis] for row in rows[start:start + length]]
+        mean = sum(part) / length
+        yield [value - mean for value in part]
+
+
+@pytest.mark.parametrize("stated", [0.1, 0.2])
+def test_drift_alone_within_half_a_second_has_the_stated_rms_about_the_window_s_mean(stated):
+    rows = truth(5, 400.0, commands=["power off", "set microsaccades 0"],
+                 constants={"eye.fixation_drift_deg": stated})
     for axis in (1, 2):
-        assert 0.08 < rms([row[axis] for row in rows]) < 0.2
+        within = [v for part in windows(rows, axis) for v in part]
+        assert size(within) == pytest.approx(stated, rel=0.05)
+        speed = [(b[axis] - a[axis]) * 1000 for a, b in zip(rows, rows[1:])]
+        assert 10 * stated < size(speed) < 20 * stated                  # deg/s: a drift, not a tremor
+        steps = [b - a for a, b in zip(speed, speed[1:])]
+        assert size(steps) < 0.25 * size(speed)                         # smooth from tick to tick
+
+
+def test_drift_is_under_way_from_the_first_moment_on():
+    first = [v for seed in range(200) for v in truth(
+        seed, 0.002, commands=["power off", "set microsaccades 0"])[0][1:3]]
+    assert 0.13 < size(first) < 0.175                                   # 0.1515 over all time
+
+
+def test_microsaccades_come_on_top_of_drift():
+    rows = {on: truth(5, 200.0, commands=["power off", f"set microsaccades {on}"]) for on in (0, 1)}
+    micro = [[b[axis] - a[axis] for a, b in zip(rows[0], rows[1])] for axis in (1, 2)]
+    assert all(0.07 < size(part) < 0.13 for part in micro)
+    within = [v for part in windows(rows[1], 1) for v in part]
+    assert 0.1 < size(within) < 0.15
+
+
+def test_blinks_come_15_a_minute_and_last_240_ms():
+    rows = truth(2, 600.0, commands=["power off"])
     pupil = [row[3] for row in rows]
-    assert 0.12 < rms(pupil) < 0.6
     assert max(abs(b - a) for a, b in zip(pupil, pupil[1:])) < 0.02     # mm in a millisecond
     lid = [row[4] for row in rows]
     closed = [k for k in range(1, len(lid)) if lid[k] < 0.01 <= lid[k - 1]]
-    assert 18 <= len(closed) <= 42                                      # 15 a minute
+    assert 120 <= len(closed) <= 180
     k = closed[0]
     start = max(j for j in range(k - 100, k) if lid[j] == 1)
     end = next(j for j in range(k, k + 300) if lid[j] == 1)

@@ -12,6 +12,10 @@ enum { ADCL = 0x78, ADCH = 0x79, ADCSRA = 0x7A, ADCSRB = 0x7B, ADMUX = 0x7C };
 enum { ADEN = 0x80, ADSC = 0x40, ADATE = 0x20, ADIF = 0x10 };
 enum { TRIGGER_SYNC_CYCLES = 3, CHANNEL_TEMPERATURE = 8, CHANNEL_BANDGAP = 14, CHANNEL_GROUND = 15 };
 
+// Stated in the comments of physics.toml, [adc].
+static const double SLOW_CLOCK_HZ = 200e3, FAST_CLOCK_HZ = 1e6, FAST_CLOCK_FACTOR = 2.25;
+static const double BANDGAP_PART = 0.1, BANDGAP_NOISE_VOLTS = 0.2e-3;
+
 static avr_cycle_count_t on_end(avr_t *avr, avr_cycle_count_t when, void *param);
 
 static avr_cycle_count_t on_join(avr_t *avr, avr_cycle_count_t when, void *param)
@@ -71,7 +75,8 @@ void adc_catch_up(struct adc *a, uint64_t cycle)
     else if (channel == CHANNEL_TEMPERATURE)
         a->held_volts = 0.314 + 0.001 * leds_temperature_k(a->leds);
     else if (channel == CHANNEL_BANDGAP)
-        a->held_volts = a->bandgap_volts + 0.2e-3 * noise_normal(a->seed, NOISE_BANDGAP, a->conversions + 8);
+        a->held_volts = a->bandgap_volts
+                      + BANDGAP_NOISE_VOLTS * noise_normal(a->seed, NOISE_BANDGAP, a->conversions);
     else if (channel == CHANNEL_GROUND)
         a->held_volts = 0;
     // A6 and A7 are wired to nothing: the capacitor keeps what it had.
@@ -104,7 +109,8 @@ static uint16_t convert(struct adc *a, uint64_t sampled_at)
 {
     uint64_t n = a->conversions++;
     double clock_hz = a->avr->frequency / (double)a->divisor;
-    double worse = clock_hz > 200e3 ? 1.0 + 1.25 * (clock_hz - 200e3) / 800e3 : 1.0;
+    double fast = fmax(clock_hz - SLOW_CLOCK_HZ, 0) / (FAST_CLOCK_HZ - SLOW_CLOCK_HZ);
+    double worse = 1.0 + (FAST_CLOCK_FACTOR - 1.0) * fast;
     double ripple = a->physics->supply.ripple_mv * 1e-3 * noise_normal(a->seed, NOISE_RIPPLE_REFERENCE, n);
     double full = reference(a, sampled_at, ripple);
     double error_lsb = a->offset_lsb
@@ -188,11 +194,11 @@ void adc_attach(struct adc *a, avr_t *avr, struct leds *leds, const struct physi
     a->avr = avr;
     a->leds = leds;
     a->physics = physics;
-    a->seed = seed;
     a->vector = &((avr_adc_t *)access_module(avr, "adc"))->adc;
     a->offset_lsb = physics->adc.offset_lsb * (noise_uniform(seed, NOISE_ADC_PART, 0) < 0.5 ? -1 : 1);
     a->gain = 1 + physics->adc.gain_error * (noise_uniform(seed, NOISE_ADC_PART, 1) < 0.5 ? -1 : 1);
-    a->bandgap_volts = physics->adc.bandgap_v * (1 + 0.1 * (2 * noise_uniform(seed, NOISE_BANDGAP, 0) - 1));
+    double bandgap_part = BANDGAP_PART * (2 * noise_uniform(seed, NOISE_BANDGAP, 0) - 1);
+    a->bandgap_volts = physics->adc.bandgap_v * (1 + bandgap_part);
     for (int k = 0; k < 3; k++)
         a->inl_phase[k] = 2 * M_PI * noise_uniform(seed, NOISE_ADC_INL, (uint64_t)k);
     double peak = 0;

@@ -31,7 +31,7 @@ struct adc {
     const struct physics *physics;
     struct leds *leds;
     avr_int_vector_t *vector;
-    uint64_t seed;
+    uint64_t seed;                // of noise, set by the board for each session; parts are drawn at attach
     uint64_t prescale_base;       // an edge of every prescaler tap
     uint64_t join_at;             // sample capacitor to the input; 0 once done
     uint64_t sample_at, end_at;   // of the conversion under way; sample_at = 0 once sampled

@@ -214,6 +214,10 @@ static void do_set(struct call *c)
         good = !strcmp(value, "auto") || real(value, 0, 1, &number);
         if (good)
             person->lid_forced = value[0] == 'a' ? -1 : number;
+    } else if (!strcmp(key, "microsaccades")) {
+        good = !strcmp(value, "0") || !strcmp(value, "1");
+        if (good)
+            person->microsaccades = value[0] == '1';
     } else if (!strcmp(key, "pupil_mean_mm")) {
         if ((good = real(value, 1.5, 8, &number)))
             person->pupil_mean_mm = number;
@@ -224,8 +228,8 @@ static void do_set(struct call *c)
         if ((good = real(value, -20, 20, &number)))
             person->slip_mm[key[5] - 'x'] = number;
     } else {
-        say(c, "err set takes ambient, light, lid, pupil_mean_mm, warmer_k, slip_x, slip_y or slip_z"
-            " and a value");
+        say(c, "err set takes ambient, light, lid, microsaccades, pupil_mean_mm, warmer_k, slip_x, slip_y"
+            " or slip_z and a value");
         return;
     }
     say(c, good ? "ok" : "err bad value");
@@ -248,11 +252,13 @@ static void do_counters(struct call *c)
     const struct bridge *b = &c->session->bridge;
     say(c, "ok uart_overruns=%" PRIu64 " rx_garbage=%" PRIu64 " tx_garbage=%" PRIu64 " rx_bytes=%" PRIu64
         " tx_bytes=%" PRIu64 " spm_denied=%" PRIu64 " page_writes=%" PRIu64 " eeprom_writes=%" PRIu64
-        " wdt_resets=%" PRIu64 " resets=%" PRIu64 " power_ons=%" PRIu64 " crashes=%" PRIu64
-        " host_dropped=%" PRIu64 " device_dropped=%" PRIu64 " clients=%d conversions=%" PRIu64,
+        " wdt_resets=%" PRIu64 " resets=%" PRIu64 " power_ons=%" PRIu64 " session=%" PRIu64
+        " crashes=%" PRIu64 " host_dropped=%" PRIu64 " device_dropped=%" PRIu64 " clients=%d"
+        " conversions=%" PRIu64,
         n->uart.overruns, n->uart.rx_garbage, n->uart.tx_garbage, n->uart.rx_bytes, n->uart.tx_bytes,
         n->selfprog.denied, n->selfprog.page_writes, n->eeprom.writes, n->watchdog_resets, n->resets,
-        n->power_ons, n->crashes, b->host_dropped, b->device_dropped, b->clients, n->adc.conversions);
+        n->power_ons, n->session, n->crashes, b->host_dropped, b->device_dropped, b->clients,
+        n->adc.conversions);
 }
 
 // For bench tests: a node's voltage now, how it is driven, when that began or a sample was taken, and what

@@ -126,6 +126,8 @@ static int store(struct config *c, bool *seen, const char *key, const char *valu
     }
     if (!strcmp(key, "pupil_mean_mm"))
         return number(value, 1.5, 8, &c->pupil_mean_mm);
+    if (!strcmp(key, "map_reference"))
+        return number(value, 1e-30, 1e30, &c->map_reference);
     if (!strcmp(key, "ambient"))
         return config_ambient(value, &c->ambient);
     if (!strcmp(key, "light"))

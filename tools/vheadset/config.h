@@ -41,6 +41,7 @@ struct config {
     enum ambient ambient;
     enum light light;
     double pupil_mean_mm;                // 0 = drawn from the seed
+    double map_reference;                // sim_map_mean() of a map that gives nominal_na; 0 = of this map
     struct physics physics;
 };
 

@@ -13,7 +13,10 @@
 
 enum { PINC = 0x26, DDRC = 0x27, PORTC = 0x28, DDRD = 0x2A, PORTD = 0x2B, MCUCR = 0x55, PUD = 0x10 };
 static const double BUILT_IN_VOLTS = 0.7, GRADING = 0.4, FLOOR_VOLTS = -0.25, FORWARD_VOLTS = 1.2;
-static const double PULLUP_OHM = 35e3, LED_AMPERES = 0.020;
+static const double PULLUP_OHM = 35e3;
+// Stated in the comments of physics.toml, [photocurrent], [node] and [ambient].
+static const double LED_AMPERES = 0.020, LEAKAGE_DOUBLES_K = 10;
+static const double ROOM_FLICKER = 0.3, BRIGHT_ROOM_FLICKER = 0.5;
 static const uint64_t RESPONSE_REUSE_CYCLES = 800;  // 50 us: the fastest saccade turns 0.03 deg
 
 double leds_charge_pc(const struct physics *p, double volts, double extra_pf)
@@ -92,7 +95,8 @@ static double ambient_na(const struct leds *l, uint64_t from, uint64_t to)
     if (l->ambient_flicker == 0 || to <= from)
         return steady;
     double w = 2 * M_PI * l->flicker_hz / l->cycles_per_true_second;
-    double wave = (sin(w * (double)to) - sin(w * (double)from)) / (w * (double)(to - from));
+    double end = w * (double)to + l->flicker_phase, begin = w * (double)from + l->flicker_phase;
+    double wave = (sin(end) - sin(begin)) / (w * (double)(to - from));
     return steady * (1 - l->ambient_flicker * wave);
 }
 
@@ -113,7 +117,7 @@ static void discharge(struct leds *l, int i, uint64_t to)
             end = to;
         if (end <= from)
             continue;
-        double current_na = led->leakage_na * exp2(l->warmer_k / 10)
+        double current_na = led->leakage_na * exp2(l->warmer_k / LEAKAGE_DOUBLES_K)
                           + led->sensor * ambient_na(l, from, end);
         uint8_t lit = (uint8_t)(led->stretch[k].lit & ~(1u << i));
         if (lit && l->map) {
@@ -328,11 +332,17 @@ static uint8_t read_pins(avr_t *avr, avr_io_addr_t at, void *param)
     return avr->data[at] = value;
 }
 
+void leds_seed(struct leds *l, uint64_t seed)
+{
+    l->seed = seed;
+    l->flicker_phase = 2 * M_PI * noise_uniform(seed, NOISE_FLICKER_PHASE, 0);
+}
+
 void leds_set_ambient(struct leds *l, enum ambient ambient)
 {
     const double na[] = {l->physics->ambient.dark_na, l->physics->ambient.room_na,
                          l->physics->ambient.bright_room_na, l->physics->ambient.sun_gap_na};
-    const double flicker[] = {0, 0.3, 0.5, 0};
+    const double flicker[] = {0, ROOM_FLICKER, BRIGHT_ROOM_FLICKER, 0};
     l->ambient_na = na[ambient];
     l->ambient_flicker = flicker[ambient];
 }
@@ -342,7 +352,8 @@ void leds_set_light(struct leds *l, enum light light)
     const double na[] = {l->physics->photocurrent.nominal_na, l->physics->photocurrent.dim_na,
                          l->physics->photocurrent.bright_na};
     l->sensitivity = na[light] / na[LIGHT_NOMINAL];
-    l->scale_na = l->map ? na[light] / sim_map_mean(l->map) : 0;
+    double mean = l->map_reference > 0 || !l->map ? l->map_reference : sim_map_mean(l->map);
+    l->scale_na = l->map ? na[light] / mean : 0;
 }
 
 void leds_attach(struct leds *l, avr_t *avr, struct adc *adc, struct person *person,
@@ -359,16 +370,17 @@ void leds_attach(struct leds *l, avr_t *avr, struct adc *adc, struct person *per
     l->adc = adc;
     l->person = person;
     l->map = map;
+    l->map_reference = config->map_reference;
     l->physics = p;
-    l->seed = config->seed;
     l->cycles_per_true_second = cycles_per_true_second;
-    l->flicker_hz = noise_uniform(l->seed, NOISE_FLICKER, 0) < 0.5 ? 100 : 120;
+    l->flicker_hz = noise_uniform(config->seed, NOISE_FLICKER, 0) < 0.5 ? 100 : 120;
+    double spread = p->photocurrent.part_spread;
     for (int i = 0; i < LEDS_COUNT; i++) {
         struct led *led = &l->led[i];
-        led->sensor = noise_spread(p->photocurrent.part_spread, l->seed, NOISE_SENSOR_SPREAD, (uint64_t)i);
-        led->emitter = noise_spread(p->photocurrent.part_spread, l->seed, NOISE_EMITTER_SPREAD, (uint64_t)i);
+        led->sensor = noise_spread(spread, config->seed, NOISE_SENSOR_SPREAD, (uint64_t)i);
+        led->emitter = noise_spread(spread, config->seed, NOISE_EMITTER_SPREAD, (uint64_t)i);
         led->leakage_na = p->node.leakage_na
-                        * noise_spread(p->node.leakage_spread, l->seed, NOISE_LEAKAGE, (uint64_t)i);
+                        * noise_spread(p->node.leakage_spread, config->seed, NOISE_LEAKAGE, (uint64_t)i);
     }
     leds_set_ambient(l, config->ambient);
     leds_set_light(l, config->light);

@@ -59,9 +59,10 @@ struct leds {
     struct adc *adc;
     uint64_t seed;
     double cycles_per_true_second;
+    double map_reference;      // mean of the map that gives nominal_na; 0 = this map's own
     double scale_na;           // photocurrent per map unit
     double sensitivity;        // of this light level, relative to nominal
-    double ambient_na, ambient_flicker, flicker_hz;
+    double ambient_na, ambient_flicker, flicker_hz, flicker_phase;
     double warmer_k;           // headset temperature above 25 C
     uint8_t port_c, ddr_c, port_d, ddr_d;
     uint8_t lit;
@@ -80,6 +81,8 @@ void leds_attach(struct leds *leds, avr_t *avr, struct adc *adc, struct person *
 // After every reset of the chip: all pins are inputs. fresh: power was off, every node is empty.
 void leds_reset(struct leds *leds, bool fresh);
 
+// Draw noise from here on: the seed of a session.
+void leds_seed(struct leds *leds, uint64_t seed);
 void leds_set_ambient(struct leds *leds, enum ambient ambient);
 void leds_set_light(struct leds *leds, enum light light);
 

@@ -5,6 +5,7 @@
 #include <signal.h>
 #include <stdio.h>
 #include <string.h>
+#include <sys/stat.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -39,12 +40,30 @@ static void on_sent(void *param, uint8_t byte, uint64_t cycle)
         markers_log(param, "delimiter", cycle);
 }
 
-// Make path a link to the port, replacing an older one at once.
+// Make path a link to the port, replacing an older link at once, and nothing else: a file or directory of
+// that name is somebody's. Returns 0, or -1 with errno set, EEXIST when it is not ours to replace.
 static int make_link(const char *path, const char *port)
 {
     char temporary[CONFIG_PATH_BYTES + 32];
+    struct stat there;
+    if (!symlink(port, path))
+        return 0;
+    if (errno != EEXIST || lstat(path, &there))
+        return -1;
+    if (!S_ISLNK(there.st_mode)) {
+        errno = EEXIST;
+        return -1;
+    }
     snprintf(temporary, sizeof temporary, "%s.%ld", path, (long)getpid());
-    return symlink(port, temporary) || rename(temporary, path) ? -1 : 0;
+    if (symlink(port, temporary))
+        return -1;
+    if (rename(temporary, path)) {
+        int keep = errno;
+        unlink(temporary);
+        errno = keep;
+        return -1;
+    }
+    return 0;
 }
 
 static void remove_link(const char *path, const char *port)
@@ -111,7 +130,11 @@ int main(int argc, char **argv)
         return 1;
     }
     if (*config.link && make_link(config.link, session.bridge.port)) {
-        fprintf(stderr, "vheadset: cannot link %s: %s\n", config.link, strerror(errno));
+        fprintf(stderr, errno == EEXIST
+                ? "vheadset: %s exists and is not a symbolic link: remove it or name another path\n"
+                : "vheadset: cannot link %s: %m\n", config.link);
+        control_close(&control);
+        session_close(&session);
         return 1;
     }
     printf("{\"port\": ");

@@ -15,6 +15,7 @@
 
 enum { ACSR = 0x50, MCUSR = 0x54, SRAM = 0x100, SRAM_END = 0x900, BATCH_CYCLES = 16000 };
 static const char FLASH_IMAGE[] = "flash.bin", EEPROM_IMAGE[] = "eeprom.bin";
+static const char SESSION_COUNT[] = "power_ons.bin";
 
 // Of libsimavr; exported but not declared in an installed header.
 avr_flashaddr_t avr_run_one(avr_t *avr);
@@ -99,28 +100,45 @@ void nano_press_reset(struct nano *nano)
     bridge_flush_to_host(nano->bridge);
 }
 
-static void power_on(struct nano *nano)
+static void seed_noise(struct nano *nano)
+{
+    nano->noise_seed = noise_session(nano->config.seed, nano->session);
+    nano->adc.seed = nano->uart.seed = nano->noise_seed;
+    person_seed(&nano->person, nano->noise_seed);
+    leds_seed(&nano->leds, nano->noise_seed);
+}
+
+// The count on disk is that of the next session: a program that is killed has used its own up.
+static int power_on(struct nano *nano)
 {
     avr_t *avr = nano->avr;
-    uint64_t n = nano->power_ons++ * SRAM_END;
+    if (nano->power_ons) {
+        nano->session++;
+        seed_noise(nano);
+    }
+    uint8_t next[8];
+    for (unsigned i = 0; i < sizeof next; i++)
+        next[i] = (uint8_t)((nano->session + 1) >> 8 * i);
+    if (images_save(nano->config.state, SESSION_COUNT, next, sizeof next))
+        return -1;
+    nano->power_ons++;
     nano->powered = true;
     avr_reset(avr);
     for (int i = 0; i < SRAM_END; i++)
         if (i < 32 || i >= SRAM)
-            avr->data[i] = (uint8_t)noise_bits(nano->config.seed, NOISE_SRAM, n + (uint64_t)i);
+            avr->data[i] = (uint8_t)noise_bits(nano->noise_seed, NOISE_SRAM, (uint64_t)i);
     after_reset(nano, NANO_RESET_POWER);
+    return 0;
 }
 
 int nano_power(struct nano *nano, bool on)
 {
     if (on == nano->powered)
         return 0;
-    if (on) {
-        power_on(nano);
-        return 0;
-    }
-    eeprom_cut(&nano->eeprom, nano->config.seed);
-    selfprog_cut(&nano->selfprog, nano->config.seed);
+    if (on)
+        return power_on(nano);
+    eeprom_cut(&nano->eeprom, nano->noise_seed);
+    selfprog_cut(&nano->selfprog, nano->noise_seed);
     nano->powered = false;
     nano->bridge->to_device.used = 0;
     nano->cut_cycle = UINT64_MAX;
@@ -227,6 +245,11 @@ int nano_open(struct nano *nano, const struct config *config, struct bridge *bri
             return -1;
         }
     }
+    uint8_t count[8] = {0};
+    if (images_load(config->state, SESSION_COUNT, count, sizeof count, error, error_bytes))
+        return -1;
+    for (unsigned i = 0; i < sizeof count; i++)
+        nano->session |= (uint64_t)count[i] << 8 * i;
     avr_global_logger_set(silent);
     avr_t *avr = avr_make_mcu_by_name("atmega328p");
     if (!avr || avr_init(avr)) {
@@ -241,16 +264,20 @@ int nano_open(struct nano *nano, const struct config *config, struct bridge *bri
     watchdog_attach(&nano->watchdog, avr);
     selfprog_attach(&nano->selfprog, avr, config->bootloader_start);
     eeprom_attach(&nano->eeprom, avr);
-    person_init(&nano->person, config);
+    person_init(&nano->person, config, noise_session(config->seed, nano->session));
     leds_attach(&nano->leds, avr, &nano->adc, &nano->person, nano->map, config, nano->cycles_per_true_second);
     adc_attach(&nano->adc, avr, &nano->leds, &nano->config.physics, config->seed);
     timer1_attach(&nano->timer1, avr, &nano->adc);
-    uart_attach(&nano->uart, avr, bridge, config->seed, nano->cycles_per_true_second);
+    uart_attach(&nano->uart, avr, bridge, nano->cycles_per_true_second);
     markers_attach(&nano->markers, avr);
     access_take_write(avr, MCUSR, write_mcusr, nano);
     if (load(nano, error, error_bytes))
         return -1;
-    power_on(nano);
+    seed_noise(nano);
+    if (power_on(nano)) {
+        snprintf(error, error_bytes, "cannot write %s/%s: %s", config->state, SESSION_COUNT, strerror(errno));
+        return -1;
+    }
     return 0;
 }
 

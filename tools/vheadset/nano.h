@@ -40,6 +40,8 @@ struct nano {
     struct markers markers;
     double cycles_per_true_second;
     bool powered;
+    uint64_t session;            // times the power was switched on before, ever: kept in the state folder
+    uint64_t noise_seed;         // of this session
     uint8_t reset_flags;         // MCUSR, which a reset keeps
     uint64_t cut_cycle;          // power fails there; UINT64_MAX = not planned
     uint64_t resets, watchdog_resets, power_ons, crashes;

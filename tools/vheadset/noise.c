@@ -17,6 +17,11 @@ uint64_t noise_bits(uint64_t seed, enum noise_purpose purpose, uint64_t counter)
     return mix(mix(mix(seed) ^ (uint64_t)purpose) ^ counter);
 }
 
+uint64_t noise_session(uint64_t seed, uint64_t session)
+{
+    return noise_bits(seed, NOISE_SESSION, session);
+}
+
 static double unit(uint64_t bits)
 {
     return ((double)(bits >> 11) + 0.5) * 0x1p-53;

@@ -1,6 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 // Random draws by counter: a draw depends only on (seed, purpose, counter), never on how often or when the
 // host asked for another one. That is what makes a run reproducible from its seed.
+//
+// There are two seeds. Parts (spread, leakage, offset, gain, INL, bandgap, clock error, mains frequency, the
+// person's mean pupil) are drawn from the bare one. Behaviour and noise are drawn from the seed of a session,
+// which mixes in how often the power was switched on before: what is streamed after a power cycle does not
+// replay the noise of the calibration.
 #ifndef NOISE_H
 #define NOISE_H
 
@@ -11,9 +16,11 @@ enum noise_purpose {
     NOISE_ADC, NOISE_ADC_INL, NOISE_ADC_PART, NOISE_BANDGAP, NOISE_RIPPLE_RELEASE, NOISE_RIPPLE_SAMPLE,
     NOISE_RIPPLE_REFERENCE, NOISE_SRAM, NOISE_CORRUPT, NOISE_LINE_RX, NOISE_LINE_TX,
     NOISE_EYE_PART, NOISE_EYE_BIAS, NOISE_EYE_LATENCY, NOISE_EYE_DRIFT, NOISE_EYE_MICRO, NOISE_EYE_PUPIL,
-    NOISE_EYE_HIPPUS, NOISE_EYE_BLINK,
+    NOISE_EYE_HIPPUS, NOISE_EYE_BLINK, NOISE_SESSION, NOISE_FLICKER_PHASE,
 };
 
+// The seed of behaviour and noise after the power was switched on `session` times before.
+uint64_t noise_session(uint64_t seed, uint64_t session);
 uint64_t noise_bits(uint64_t seed, enum noise_purpose purpose, uint64_t counter);
 // Uniform in (0, 1).
 double noise_uniform(uint64_t seed, enum noise_purpose purpose, uint64_t counter);

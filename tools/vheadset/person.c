@@ -7,9 +7,11 @@
 
 #include "noise.h"
 
-static const double DRIFT_S = 1.0, PUPIL_S = 10.0, HIPPUS_S = 0.25;
+static const double DRIFT_S = 0.1, PUPIL_S = 10.0, HIPPUS_S = 0.25;
+static const double FIXATION_S = 0.5;  // window that fixation_drift_deg is meant for
 static const double MICRO_PER_S = 1.2, MICRO_DEG = 0.1;
 static const double CLOSE_MS = 70, SHUT_MS = 20, OPEN_MS = 150, BLINK_GAP_MS = 800;
+// Stated in the comment of physics.toml, [eye] pupil_mm.
 static const double PUPIL_DRIFT_MM = 0.3, HIPPUS_MM = 0.15, PEOPLE_MM = 0.8;
 
 // Minimum-jerk step from 0 to 1.
@@ -34,6 +36,28 @@ static void moved(const struct person_move *m, double now_ms, double out[2])
     double x = m->length_ms > 0 ? smooth((now_ms - m->start_ms) / m->length_ms) : 1;
     for (int i = 0; i < 2; i++)
         out[i] = m->from[i] + (m->to[i] - m->from[i]) * x;
+}
+
+static const uint64_t FIRST_DRAW = 1ull << 60;  // counters of initial states, far from any tick's
+
+// Initial state of filtered(), from its stationary distribution: Var a = 2 rms^2, and with the output b,
+// Cov(a, b) / Var a = 1 / (1 + keep).
+static void settle(double stage[2], double time_s, double rms, uint64_t seed, enum noise_purpose purpose,
+                   uint64_t counter)
+{
+    double keep = exp(-1e-3 / time_s), share = 1 / (1 + keep), variance = 2 * rms * rms;
+    double output = variance * (1 - keep + 2 * keep * keep * share) * share;
+    stage[0] = sqrt(variance) * noise_normal(seed, purpose, FIRST_DRAW + counter);
+    stage[1] = share * stage[0] + sqrt(output - share * share * variance)
+             * noise_normal(seed, purpose, FIRST_DRAW + counter + 1);
+}
+
+// What of a unit variance of filtered() is left about the mean of a window: 1 - mean of its autocorrelation
+// (1 + t/T) exp(-t/T) over the window's pairs of moments.
+static double left_in_window(double time_s, double window_s)
+{
+    double n = window_s / time_s;
+    return 1 - 2 * (2 * n - 3 + (n + 3) * exp(-n)) / (n * n);
 }
 
 // Two equal first-order stages: the output has the given rms and is smooth over a millisecond.
@@ -95,18 +119,18 @@ static void tick(struct person *p, int64_t ms)
         p->micro_next_ms = now + 100
                          + exponential(p->seed, NOISE_EYE_MICRO, 3 * k + 2, 1e3 / MICRO_PER_S - 100);
     }
-    double keep = exp(-1e-3 / DRIFT_S);
+    double drift[2];
     for (int i = 0; i < 2; i++)
-        p->drift[i] = keep * p->drift[i] + sqrt(1 - keep * keep) * p->drift_deg
-                    * noise_normal(p->seed, NOISE_EYE_DRIFT, 2 * n + (uint64_t)i);
+        drift[i] = filtered(p->drift[i], DRIFT_S, p->drift_deg,
+                            noise_normal(p->seed, NOISE_EYE_DRIFT, 2 * n + (uint64_t)i));
     double pupil_draw = noise_normal(p->seed, NOISE_EYE_PUPIL, n);
-    double slow = filtered(p->pupil_slow, PUPIL_S, p->pupil_drift_mm, pupil_draw);
+    double slow = filtered(p->pupil_slow, PUPIL_S, PUPIL_DRIFT_MM, pupil_draw);
     double hippus_draw = noise_normal(p->seed, NOISE_EYE_HIPPUS, n);
-    double fast = filtered(p->hippus, HIPPUS_S, p->hippus_mm, hippus_draw);
+    double fast = filtered(p->hippus, HIPPUS_S, HIPPUS_MM, hippus_draw);
     double lid = lids(p, now, &out->blink);
-    double on = p->motion ? 1 : 0;
-    out->azimuth_deg = gaze[0] + on * (micro[0] + p->drift[0]);
-    out->elevation_deg = gaze[1] + on * (micro[1] + p->drift[1]);
+    double on = p->motion ? 1 : 0, flicks = p->microsaccades ? 1 : 0;
+    out->azimuth_deg = gaze[0] + on * (flicks * micro[0] + drift[0]);
+    out->elevation_deg = gaze[1] + on * (flicks * micro[1] + drift[1]);
     out->pupil_mm = fmin(fmax(p->pupil_mean_mm + on * (slow + fast), 1.5), 8);
     out->lid_opening = p->motion ? lid : 1;
     out->blink = out->blink && p->motion;
@@ -167,20 +191,27 @@ void person_targets_clear(struct person *p)
     p->targets = p->next;  // what was looked at stays: it is still being fixated
 }
 
-void person_init(struct person *p, const struct config *config)
+void person_seed(struct person *p, uint64_t seed)
+{
+    p->seed = seed;
+}
+
+void person_init(struct person *p, const struct config *config, uint64_t seed)
 {
     memset(p, 0, sizeof *p);
-    p->seed = config->seed;
+    p->seed = seed;
     p->bias_deg = config->physics.eye.fixation_bias_deg;
-    p->drift_deg = config->physics.eye.fixation_drift_deg;
+    p->drift_deg = config->physics.eye.fixation_drift_deg / sqrt(left_in_window(DRIFT_S, FIXATION_S));
     p->blinks_per_min = config->physics.eye.blinks_per_min;
-    p->pupil_drift_mm = PUPIL_DRIFT_MM;
-    p->hippus_mm = HIPPUS_MM;
     p->pupil_mean_mm = config->pupil_mean_mm;
     if (p->pupil_mean_mm == 0)
         p->pupil_mean_mm = fmin(fmax(config->physics.eye.pupil_mm
-                                     + PEOPLE_MM * noise_normal(p->seed, NOISE_EYE_PART, 0), 2.2), 6);
-    p->follow = p->motion = true;
+                                     + PEOPLE_MM * noise_normal(config->seed, NOISE_EYE_PART, 0), 2.2), 6);
+    p->follow = p->motion = p->microsaccades = true;
+    for (uint64_t i = 0; i < 2; i++)
+        settle(p->drift[i], DRIFT_S, p->drift_deg, seed, NOISE_EYE_DRIFT, 2 * i);
+    settle(p->pupil_slow, PUPIL_S, PUPIL_DRIFT_MM, seed, NOISE_EYE_PUPIL, 0);
+    settle(p->hippus, HIPPUS_S, HIPPUS_MM, seed, NOISE_EYE_HIPPUS, 0);
     p->lid_forced = -1;
     p->blink_start_ms = -1e9;
     p->micro_next_ms = exponential(p->seed, NOISE_EYE_MICRO, UINT64_MAX / 4, 1e3 / MICRO_PER_S);

@@ -194,14 +194,13 @@ static void on_return(avr_irq_t *irq, uint32_t running, void *param)
     access_level(u->avr, u->udre, u->avr->data[UCSR0A] & UDRE);
 }
 
-void uart_attach(struct uart *u, avr_t *avr, struct bridge *bridge, uint64_t seed,
+void uart_attach(struct uart *u, avr_t *avr, struct bridge *bridge,
                  double cycles_per_true_second)
 {
     avr_uart_t *stock = (avr_uart_t *)access_module(avr, "uart");
     memset(u, 0, sizeof *u);
     u->avr = avr;
     u->bridge = bridge;
-    u->seed = seed;
     u->cycles_per_true_second = cycles_per_true_second;
     u->rxc = &stock->rxc;
     u->udre = &stock->udrc;

@@ -26,7 +26,7 @@ struct uart {
     avr_t *avr;
     struct bridge *bridge;
     avr_int_vector_t *rxc, *udre, *txc;
-    uint64_t seed;
+    uint64_t seed;                // of a session
     double cycles_per_true_second;
     // transmitter
     uint8_t tx_data, tx_shift;
@@ -47,7 +47,7 @@ struct uart {
     void *on_sent_param;
 };
 
-void uart_attach(struct uart *uart, avr_t *avr, struct bridge *bridge, uint64_t seed,
+void uart_attach(struct uart *uart, avr_t *avr, struct bridge *bridge,
                  double cycles_per_true_second);
 void uart_reset(struct uart *uart);
 // The bridge has bytes for the chip: begin with the first if the line is idle.
