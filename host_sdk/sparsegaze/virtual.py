@@ -53,11 +53,15 @@ class VirtualNano:
     auto_reset  False: a board whose reset trace is cut: opening the port does not reset it
     bootloader  "optiboot", "atmegaboot", or a path (then bootloader_start is its address)
     app         .hex or .elf that is in flash already
-    state_dir   keeps flash and EEPROM between runs; default: a fresh one, removed at the end
+    state_dir   keeps flash, EEPROM and the count of power-ons between runs; default: a fresh one, removed at
+                the end. Behaviour and noise follow from the seed and that count: the same seed over the
+                same state repeats, a second run over it does not replay the first
     ambient     "dark", "room", "bright_room", "sun_gap";  light: "nominal", "dim", "bright"
     map         path of a response map (.sgmap) to use instead of simulating headset and person; False: no
-                light at all
-    link        symbolic link to make to the port;  truth: CSV to write the eye's true state to
+                light at all. A map that is given is scaled so that itself has the mean photocurrent of
+                physics.toml; a simulated one relative to the default headset
+    link        symbolic link to make to the port; replaces an older link, refuses anything else that is there
+    truth       CSV to write the eye's true state to
     physics     {"section.key": value} over the constants of physics.toml
     progress    handed to the response map's computation
 
@@ -71,8 +75,11 @@ class VirtualNano:
         binary = locate_vheadset()
         start, boot_hex = locate_bootloader(bootloader, bootloader_start)
         headset = Path(headset) if headset is not None else SOURCE_TREE / "headsets" / "led2gaze.toml"
+        if link is not None:
+            _refuse_to_replace(link)
+        reference = None
         if map is None:
-            map = _response_map(headset, person, progress)
+            map, reference = _response_map(headset, person, progress)
         # Short and private: a socket's path holds 107 bytes.
         folder = Path(tempfile.mkdtemp(prefix="sgv-"))
         self._finalizer = weakref.finalize(self, _clean, folder)
@@ -88,13 +95,16 @@ class VirtualNano:
         for key, path in (("app", app), ("link", link), ("truth", truth)):
             if path is not None:
                 settings[key] = _absolute(path)
+        if reference is not None:
+            settings["map_reference"] = f"{reference:.17g}"
         settings.update(_physics(binary, physics or {}))
         config = folder / "config"
         config.write_text("".join(f"{key} {value}\n" for key, value in settings.items()))
         self._process, ready = _start(binary, config, folder / "errors")
         self._finalizer.detach()
-        self._finalizer = weakref.finalize(self, _end, self._process, folder)
         self.port = ready["port"]
+        self._link = _Link(link, self.port)
+        self._finalizer = weakref.finalize(self, _end, self._process, folder, self._link)
         self.pid = self._process.pid
         self.control = VirtualControl(ready.get("control", str(control)))
         self.entry = registry.Entry(
@@ -123,6 +133,7 @@ class VirtualNano:
         """End it at once, as a pulled cable would."""
         self._process.kill()
         self._process.wait()
+        self._link.remove()
         registry.unregister(self.pid)
 
     def stop(self):
@@ -181,16 +192,18 @@ def locate_bootloader(name="optiboot", start=None):
 
 
 def _response_map(headset, person, progress):
+    """(path of the map, mean of the map that gives the nominal photocurrent)."""
     from .headset import load_headset
     from .person import draw_person
-    from .simulate import response_map
+    from . import simulate
 
     share = None if progress is None else lambda done: progress("map", done, 1.0)
     try:
-        return response_map(load_headset(headset), draw_person(person), progress=share)
+        path = simulate.response_map(load_headset(headset), draw_person(person), progress=share)
     except OSError as error:
         raise VirtualError(f"the response map cannot be written ({error})",
                            "make room, or set XDG_CACHE_HOME to a directory of yours") from None
+    return path, simulate.REFERENCE_MEAN
 
 
 def _physics(binary, changes):
@@ -243,7 +256,39 @@ def _start(binary, config, errors):
     return process, parsed
 
 
-def _end(process, folder):
+class _Link:
+    """The symbolic link that a simulator made: removed by us when it was killed before it could."""
+
+    def __init__(self, path, port):
+        self.path, self.port = None if path is None else _absolute(path), port
+        self.made = self._identity()
+
+    def _identity(self):
+        # The port's number comes back with the next simulator: its link is told from ours by inode and time.
+        try:
+            if self.path is not None and os.readlink(self.path) == self.port:
+                found = os.lstat(self.path)
+                return found.st_dev, found.st_ino, found.st_mtime_ns
+        except OSError:                         # gone, or no link any more
+            pass
+        return None
+
+    def remove(self):
+        if self.made is not None and self._identity() == self.made:
+            try:
+                os.unlink(self.path)
+            except OSError:                     # a folder that became read-only: nothing else of ours is in it
+                pass
+        self.made = None
+
+
+def _refuse_to_replace(link):
+    if os.path.lexists(link) and not os.path.islink(link):
+        raise VirtualError(f"{os.fspath(link)} exists and is not a symbolic link",
+                           "remove it, or name another path for the link")
+
+
+def _end(process, folder, link):
     registry.unregister(process.pid)
     if process.poll() is None:
         process.terminate()
@@ -252,6 +297,7 @@ def _end(process, folder):
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+    link.remove()
     if process.stdout is not None:
         process.stdout.close()
     _clean(folder)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The program around the board: constants, configuration, control socket, hostile input, clean end."""
 
+import hashlib
 import os
 import pathlib
 import random
@@ -13,11 +14,15 @@ import pytest
 from board import PHYSICS, PROGRAM, QUIET, REPO, Board, firmware, physics
 
 
-def test_constants_equal_the_shared_file():
-    """Where the project's shared folder is at hand; elsewhere there is nothing to compare."""
+# The constants are fixed for the project: kinder ones are a change of this line too.
+PHYSICS_SHA256 = "915aaea20fff0b1a9e962d54964a42b66aea92f4b2d2e86e00e41c90763344ee"
+
+
+def test_constants_are_the_fixed_ones_and_equal_the_shared_file_where_there_is_one():
+    assert hashlib.sha256(PHYSICS.read_bytes()).hexdigest() == PHYSICS_SHA256
     shared = REPO.parent / "shared" / "physics.toml"
-    reference = shared if shared.exists() else PHYSICS
-    assert PHYSICS.read_bytes() == reference.read_bytes()
+    if shared.exists():
+        assert PHYSICS.read_bytes() == shared.read_bytes()
 
 
 def test_program_requires_exactly_the_keys_of_the_file():
@@ -101,6 +106,55 @@ def test_control_socket_survives_garbage():
         board.run(1000)
         board.send(b"a")
         assert board.run(1000) == b"b"
+
+
+@pytest.mark.parametrize("kind", ["file", "empty file", "folder", "fifo", "socket"])
+def test_link_never_replaces_what_is_not_a_link(tmp_path, good, kind):
+    path = tmp_path / "port"
+    with socket.socket(socket.AF_UNIX) as bound:
+        if kind == "folder":
+            path.mkdir()
+            (path / "kept").write_text("kept")
+        elif kind == "fifo":
+            os.mkfifo(path)
+        elif kind == "socket":
+            bound.bind(str(path))
+        else:
+            path.write_text("" if kind == "empty file" else "somebody's")
+        before = path.lstat()
+        done = start(tmp_path, good + [f"link {path}"])
+    assert done.returncode == 1 and done.stdout == "" and done.stderr.count("\n") == 1
+    assert f"{path} exists and is not a symbolic link: remove it" in done.stderr
+    after = path.lstat()
+    assert (before.st_ino, before.st_mode, before.st_size) == (after.st_ino, after.st_mode, after.st_size)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["config", "port", "state"]
+    if kind == "folder":
+        assert (path / "kept").read_text() == "kept"
+
+
+@pytest.mark.parametrize("old", ["target", "missing", "folder"])
+def test_an_older_link_is_replaced_and_what_it_pointed_at_stays(tmp_path, old):
+    (tmp_path / "target").write_text("kept")
+    (tmp_path / "folder").mkdir()
+    link = tmp_path / "port"
+    link.symlink_to(tmp_path / old)
+    with Board(app=firmware("echo"), link=link) as board:
+        assert os.readlink(link) == board.ready["port"]
+    assert not link.is_symlink()
+    assert (tmp_path / "target").read_text() == "kept" and (tmp_path / "folder").is_dir()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["folder", "target"]
+
+
+@pytest.mark.parametrize("successor", ["link", "file"])
+def test_at_the_end_only_its_own_link_is_removed(tmp_path, successor):
+    link = tmp_path / "port"
+    with Board(app=firmware("echo"), link=link):
+        link.unlink()
+        if successor == "link":
+            link.symlink_to("/dev/null")
+        else:
+            link.write_text("somebody's")
+    assert link.is_symlink() if successor == "link" else link.read_text() == "somebody's"
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT, "quit"])

@@ -64,7 +64,8 @@ def test_parts_are_the_same_in_every_session_and_noise_is_not(tmp_path):
 def test_mains_flicker_begins_each_session_at_a_phase_of_its_own(tmp_path):
     held = []
     for _ in range(4):
-        with Board(app=firmware("adc"), constants=QUIET, ambient="bright_room", state=tmp_path / "a") as board:
+        with Board(app=firmware("adc"), constants=QUIET, ambient="bright_room",
+                   state=tmp_path / "a") as board:
             held.append(round(exposure(board, ticks=2000)[3], 6))
     assert len(set(held)) == 4
 
