@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""tools/report.py: the README's table is what the report says, or --check fails."""
+
+import json
+import sys
+
+import pytest
+import report as module
+
+
+@pytest.fixture
+def tool(monkeypatch, tmp_path, good):
+    """tool(*args) runs it on tmp_path/report.json (the good report) and tmp_path/README.md; the exit code."""
+    (tmp_path / "report.json").write_text(json.dumps(good))
+    (tmp_path / "README.md").write_text(f"# Title\n\n{module.BEGIN}\nold\n{module.END}\n\nrest\n")
+
+    def run(*args):
+        files = ["--report", str(tmp_path / "report.json"), "--readme", str(tmp_path / "README.md")]
+        monkeypatch.setattr(sys, "argv", ["report.py", *files, *args])
+        return module.main()
+
+    return run
+
+
+def test_table_shows_the_figures_of_the_report(good):
+    table = module.table(good)
+    assert "simulated person 1" in table and "**0.70** / 0.60 / 1.50 deg" in table
+    for figure in ("260.4 Hz", "6510, 0, 0", "64 vectors", "15,900, 24,700 of 61,440 cycles", "4.10 ms, 2.50 ms"):
+        assert figure in table
+    assert {line.count("|") for line in table.splitlines()} == {4}
+
+
+def test_check_fails_before_the_rewrite_passes_after_it_and_fails_for_another_report(tool, tmp_path, good):
+    assert tool("--check") == 1
+    assert "old" in (tmp_path / "README.md").read_text()
+    assert tool() == 0
+    text = (tmp_path / "README.md").read_text()
+    assert text == f"# Title\n\n{module.BEGIN}\n{module.table(good)}\n{module.END}\n\nrest\n"
+    assert tool("--check") == 0
+    good["accuracy"]["mean_deg"] = 0.71
+    (tmp_path / "report.json").write_text(json.dumps(good))
+    assert tool("--check") == 1
+
+
+def test_a_readme_without_markers_and_a_report_that_is_missing_are_errors(tool, tmp_path, capsys):
+    (tmp_path / "README.md").write_text("# Title\n")
+    assert tool() == 1 and "markers" in capsys.readouterr().err
+    assert (tmp_path / "README.md").read_text() == "# Title\n"
+    (tmp_path / "report.json").unlink()
+    assert tool("--check") == 1 and "make demo" in capsys.readouterr().err
