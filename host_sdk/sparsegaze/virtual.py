@@ -62,7 +62,8 @@ class VirtualNano:
                 physics.toml; a simulated one relative to the default headset
     link        symbolic link to make to the port; replaces an older link, refuses anything else that is there
     truth       CSV to write the eye's true state to
-    physics     {"section.key": value} over the constants of physics.toml
+    physics     {"section.key": value} over the constants of physics.toml; eye.lid_follow_gain acts through the
+                simulated map, so not on a map that is given
     progress    handed to the response map's computation
 
     port, control (VirtualControl), pid, entry (registry.Entry)
@@ -77,9 +78,10 @@ class VirtualNano:
         headset = Path(headset) if headset is not None else SOURCE_TREE / "headsets" / "led2gaze.toml"
         if link is not None:
             _refuse_to_replace(link)
+        constants = _physics(binary, physics or {})
         reference = None
         if map is None:
-            map, reference = _response_map(headset, person, progress)
+            map, reference = _response_map(headset, person, constants["eye.lid_follow_gain"], progress)
         # Short and private: a socket's path holds 107 bytes.
         folder = Path(tempfile.mkdtemp(prefix="sgv-"))
         self._finalizer = weakref.finalize(self, _clean, folder)
@@ -97,7 +99,7 @@ class VirtualNano:
                 settings[key] = _absolute(path)
         if reference is not None:
             settings["map_reference"] = f"{reference:.17g}"
-        settings.update(_physics(binary, physics or {}))
+        settings.update(constants)
         config = folder / "config"
         config.write_text("".join(f"{key} {value}\n" for key, value in settings.items()))
         self._process, ready = _start(binary, config, folder / "errors")
@@ -191,7 +193,7 @@ def locate_bootloader(name="optiboot", start=None):
                        f"`apt-get install arduino-core-avr`, or set {variable} to the file")
 
 
-def _response_map(headset, person, progress):
+def _response_map(headset, person, lid_follow_gain, progress):
     """(path of the map, mean of the map that gives the nominal photocurrent)."""
     from .headset import load_headset
     from .person import draw_person
@@ -199,7 +201,8 @@ def _response_map(headset, person, progress):
 
     share = None if progress is None else lambda done: progress("map", done, 1.0)
     try:
-        path = simulate.response_map(load_headset(headset), draw_person(person), progress=share)
+        path = simulate.response_map(load_headset(headset), draw_person(person, float(lid_follow_gain)),
+                                     progress=share)
     except OSError as error:
         raise VirtualError(f"the response map cannot be written ({error})",
                            "make room, or set XDG_CACHE_HOME to a directory of yours") from None

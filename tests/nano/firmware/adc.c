@@ -6,6 +6,7 @@
 //   'L'                    started on a high channel, multiplexer moved to a low one: both codes
 //   'F'                    ADIF: set after a conversion, cleared by writing one: two bytes
 //   'E'                    matches while OCF1B stays set, then after clearing it: conversions seen, two bytes
+//   'B'                    the bandgap against AVcc: code16
 //   'I'                    interrupts counted while free running for 10 conversions' time
 //   'X' lit, flags, ticks16, dark16   an exposure of LED 0: code16
 //        flags 1: leave the pull-up on   2: sample capacitor from a low channel   4: lights out at `dark`
@@ -176,6 +177,7 @@ int main(void)
         case 'L': latch(); break;
         case 'F': flag(); break;
         case 'E': edge(); break;
+        case 'B': bench_put16(convert(14)); break;
         case 'I': count_interrupts(); break;
         case 'X': expose(); break;
         }
