@@ -4,6 +4,7 @@
 import contextlib
 import os
 import time
+import warnings
 
 import click
 
@@ -192,6 +193,7 @@ def record(port, output, n_targets, seed, distance_mm, width_mm, windowed, as_js
     """
     from . import capture, targets
     from .device import Device
+    from .fixations import TARGETS_NEEDED
 
     console = Console(as_json)
     with Device(port) as device, _screen(device, _window(distance_mm, width_mm, windowed)) as shown:
@@ -200,7 +202,13 @@ def record(port, output, n_targets, seed, distance_mm, width_mm, windowed, as_js
         with console.progress() as progress:
             taken = capture.run(device, shown, plan, output, meta, progress)
     chosen = taken.selection
-    for note in taken.run.notes:
+    notes = list(taken.run.notes)
+    if chosen.used_targets < TARGETS_NEEDED:
+        notes.append(
+            f"{chosen.used_targets} usable targets are too few for `sparsegaze fit`, which needs "
+            f"{TARGETS_NEEDED}: record again with more --targets"
+        )
+    for note in notes:
         console.warn(note)
     counts = chosen.counts()
     console.result(
@@ -211,6 +219,7 @@ def record(port, output, n_targets, seed, distance_mm, width_mm, windowed, as_js
             "frames": {"all": len(taken.recording), **counts},
             "lost": taken.run.lost,
             "rate_hz": taken.run.rate_hz,
+            "warnings": notes,
         },
         f"{output}: {len(taken.recording)} frames, {counts.get('used', 0)} valid, {chosen.used_targets} of "
         f"{chosen.n_targets} targets, {taken.run.lost} lost",
@@ -241,15 +250,25 @@ def fit(file, output, vectors, as_json):
 
     console = Console(as_json)
     recording = Recording.read(file)
-    with console.progress() as progress:
+    with console.progress() as progress, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
         progress("fit", 0, 1)
         fitted = fit_recording(recording, n_vectors=vectors)
         progress("fit", 1, 1)
+    doubts = [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
+    for doubt in doubts:
+        console.warn(doubt)
     output = output or os.path.splitext(file)[0] + ".sgm"
     fitted.model.save(output)
     report = plain(fitted.report)
     console.result(
-        {"file": output, "n_vectors": fitted.model.vectors, "crc": fitted.model.crc, "report": report},
+        {
+            "file": output,
+            "n_vectors": fitted.model.vectors,
+            "crc": fitted.model.crc,
+            "report": report,
+            "warnings": doubts,
+        },
         f"{output}: {fitted.model.vectors} vectors, crc 0x{fitted.model.crc:08X}",
         *_report_lines(report),
     )

@@ -38,6 +38,7 @@ ROWS_MAX, LEARN_MAX = 2000, 400  # rows of the final process, and of the one who
 CLOUD_EACH = 50
 OUTLIER_SIGMAS, OUTLIER_ROUNDS = 6.0, 3
 FIRST_STEPS, LATER_STEPS = 1500, 60
+LOO_DOUBTFUL_DEG = 3.0  # twice what people reach with such a headset; gaze at random has about 18
 
 
 @dataclass(frozen=True)
@@ -74,10 +75,8 @@ def distil(gp, features, gaze_deg, n_vectors=64, seed=0, noise=None, points=None
     if not 1 <= n_vectors <= VECTORS_MAX:
         raise ModelError(f"{n_vectors} vectors do not fit the device", f"ask for 1 to {VECTORS_MAX}")
     if len(features) < 2 or features.shape[1] > CHANNELS:
-        raise CalibrationError(
-            f"{len(features)} samples of {features.shape[1:]} channels do not do",
-            f"give at least 2 samples of at most {CHANNELS} channels",
-        )
+        few = f"{len(features)} samples of {features.shape[1:]} channels do not do"
+        raise CalibrationError(few, f"give at least 2 samples of at most {CHANNELS} channels")
     rng = np.random.default_rng([0x647374, seed])
     order = np.lexsort(np.column_stack([features, gaze]).T)  # the order of the samples must not matter
     features, gaze = features[order], gaze[order]
@@ -98,23 +97,19 @@ def distil(gp, features, gaze_deg, n_vectors=64, seed=0, noise=None, points=None
         if made:
             break
     else:
-        raise CalibrationError(
-            "no number format holds the weights of this model", "calibrate again with more targets"
-        )
+        none = "no number format holds the weights of this model"
+        raise CalibrationError(none, "calibrate again with more targets")
     model, bound_deg = made
     fitted = np.clip(np.rint(cloud[held]), 0, 65535).astype(np.uint16)
     az, el, flags = emulate(model, fitted)
     miss = np.hypot(az / 128.0 - target[held, 0], el / 128.0 - target[held, 1])
     weights = model.weights / 2.0**model.weight_frac_bits
+    rms_deg, max_deg = float(np.sqrt(np.mean(miss**2))), float(miss.max())
+    refused = float(np.mean(flags & 4 != 0))
+    span = float(weights.min()), float(weights.max())
+    fitted_to = int((~held).sum())
     return model, DistilReport(
-        float(np.sqrt(np.mean(miss**2))),
-        float(miss.max()),
-        float(np.mean(flags & 4 != 0)),
-        model.vectors,
-        model.weight_frac_bits,
-        (float(weights.min()), float(weights.max())),
-        bound_deg,
-        int((~held).sum()),
+        rms_deg, max_deg, refused, model.vectors, model.weight_frac_bits, span, bound_deg, fitted_to
     )
 
 
@@ -301,7 +296,8 @@ class FitReport:
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # the matrices are small: threads cost 20 times their gain
 def fit_recording(recording, n_vectors=64, seed=0):
-    """Recording -> FitResult. Raises RecordingError or CalibrationError; warns of channels it drops.
+    """Recording -> FitResult. Raises RecordingError or CalibrationError; warns of channels it drops and of
+    a recording that hardly depends on its targets.
 
     Length scales and noise are learnt from the fixations' means, of which each is one observation. The final
     process is then given single frames, with that noise each: the device judges single frames, and a process
@@ -328,7 +324,12 @@ def fit_recording(recording, n_vectors=64, seed=0):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             learnt = _learn(fixed, seed)
-    predicted, _ = learnt.loo()
+    loo_rms_deg = float(np.sqrt(np.mean(np.sum((learnt.y - learnt.loo()[0]) ** 2, axis=1))))
+    if loo_rms_deg > LOO_DOUBTFUL_DEG:
+        warnings.warn(
+            f"targets that are left out are missed by {loo_rms_deg:.1f} deg: this recording says little about "
+            "where the eye looked; check the headset's seat and record again, with more targets"
+        )
     rows = _thin(fixed.frames(max(1, min(FRAMES_EACH, ROWS_MAX // len(fixed.mean)))), ROWS_MAX)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -348,7 +349,7 @@ def fit_recording(recording, n_vectors=64, seed=0):
             len(fixed.features),
             fixed.rejected,
             lost,
-            float(np.sqrt(np.mean(np.sum((learnt.y - predicted) ** 2, axis=1)))),
+            loo_rms_deg,
             learnt.lml,
             learnt.condition,
             learnt.jitter,
@@ -387,14 +388,8 @@ def spread_out(fixed, rows, seed):
 
 def _learn(fixed, seed):
     rows = _thin(np.arange(len(fixed.mean)), LEARN_MAX)
-    return GaussianProcess.fit(
-        fixed.mean[rows],
-        fixed.target[rows],
-        fixed.noise_scale()[rows],
-        mean=MEAN,
-        seed=seed,
-        length_max=LENGTH_MAX,
-    )
+    known = fixed.mean[rows], fixed.target[rows], fixed.noise_scale()[rows]
+    return GaussianProcess.fit(*known, mean=MEAN, seed=seed, length_max=LENGTH_MAX)
 
 
 def _thin(rows, most):

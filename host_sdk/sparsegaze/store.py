@@ -131,7 +131,7 @@ def _check_fit(image, hello):
         raise ModelError(f"the model has format version {head.version}, "
                          f"the device takes {hello.model_version}",
                          "run `sparsegaze flash` with the firmware of this SDK")
-    if head.channels > hello.channels:
+    if head.channels != hello.channels:     # a channel that the fit dropped keeps its place, with gain 0
         raise ModelError(f"the model takes {head.channels} channels, the device has {hello.channels}",
                          "fit a recording of this device")
     if len(image) > hello.slot_bytes:

@@ -142,7 +142,7 @@ def run(
                 dict of arguments of WindowScreen)
     csv         path: the whole stream is kept there; truth: also ask a virtual Nano where the eye really
                 looked
-    Raises PortError, NoDeviceError, DeviceError (no model), CalibrationError.
+    Raises PortError, NoDeviceError, CalibrationError (no model in the device, no frames).
     """
     from .device import Device
     from .screen import screen_for
@@ -159,8 +159,13 @@ def run(
 
 def measure(device, screen, plan, csv=None, truth=True, progress=None):
     """Validate an open device with a given plan on a given screen. Returns Validation; see `run`."""
+    from .errors import CalibrationError
     from .model import DeviceModel
+    from .wire import lib
 
+    if device.model_info().active == lib.SG_SLOT_NONE:
+        port = getattr(device, "port", "PORT")
+        raise CalibrationError("the device has no model", f"run `sparsegaze calibrate {port}`")
     model = DeviceModel(device.read_model())
     control = getattr(screen, "control", None) if truth else None
     writer = None if csv is None else GazeCsv(csv, {"plan": plan.name, "model_crc": f"0x{model.crc:08X}"})

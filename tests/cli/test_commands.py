@@ -173,11 +173,11 @@ def test_stream_csv_replays_bit_identical_and_a_changed_gaze_does_not(command_js
     assert (
         code == 0
         and data["seconds"] == pytest.approx(3.0, abs=0.01)
-        and data["frames"] == 834
+        and data["frames"] == 782
         and data["lost"] == 0
     )
     code, data, _ = command_json("replay", gaze, "--model", model)
-    assert code == 0 and data["identical"] is True and data["compared"] == 834 and data["valid"] < 834
+    assert code == 0 and data["identical"] is True and data["compared"] == 782 and data["valid"] < 782
     lines = gaze.read_text().splitlines()
     row = lines[100].split(",")
     row[3] = f"{float(row[3]) + 1 / 128:.7f}"
@@ -185,8 +185,8 @@ def test_stream_csv_replays_bit_identical_and_a_changed_gaze_does_not(command_js
     code, data, _ = command_json("replay", gaze, "--model", model)
     assert code == 1 and data["identical"] is False and data["differing"] == 1
     code, out, _ = command("replay", gaze, "--model", model, "-o", tmp_path / "again.csv")
-    assert "1 of 834 DIFFER" in out
-    assert len((tmp_path / "again.csv").read_text().splitlines()) == 835
+    assert "1 of 782 DIFFER" in out
+    assert len((tmp_path / "again.csv").read_text().splitlines()) == 783
 
 
 def test_stream_to_stdout_is_pure_csv(command, fake):
@@ -196,8 +196,8 @@ def test_stream_to_stdout_is_pure_csv(command, fake):
     assert code == 0 and lines[0].startswith(
         "t_us,host_time_s,seq,azimuth_deg,elevation_deg,flags,s0,s1,s2,s3,s4,s5"
     )
-    assert all(line.count(",") == lines[0].count(",") for line in lines) and len(lines) == 279
-    assert "278 frames" in err
+    assert all(line.count(",") == lines[0].count(",") for line in lines) and len(lines) == 262
+    assert "261 frames" in err
 
 
 def test_stream_without_a_model_says_that_nothing_is_valid(command_json, fake):

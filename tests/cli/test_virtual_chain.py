@@ -77,8 +77,9 @@ def test_calibrate(command_json, nano, kept):
     assert data["n_targets"] == 36 and data["used_targets"] >= 30 and data["recording_lost"] == 0
     assert data["crc_host"] == data["crc_device"] and data["stream"]["bit_identical"] is True
     assert data["stream"]["lost"] == 0 and data["stream"]["rate_hz"] >= 250
-    # The person follows the targets: far below the ~16 degrees of somebody who does not.
-    assert data["accuracy"]["median_deg"] < 3.0 and data["accuracy"]["to_true_gaze_mean_deg"] < 5.0
+    # 36 targets over optics without a face: 0.66 and 0.67 deg for this person, of whom 0.44 is his own bias.
+    assert data["accuracy"]["median_deg"] < 1.0 and data["accuracy"]["to_true_gaze_mean_deg"] < 1.0
+    assert data["accuracy"]["data_loss_percent"] < 30.0
 
 
 def test_recorded_frames_show_the_simulated_blinks(kept):

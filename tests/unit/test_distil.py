@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sparsegaze import distil as module
+from sparsegaze import fixations as fixations_module
 from sparsegaze import rounding
 from sparsegaze.distil import distil, fit_recording
 from sparsegaze.errors import CalibrationError, ModelError, RecordingError
@@ -216,6 +217,7 @@ def test_a_constant_channel_is_dropped_with_a_warning_and_ignored_by_the_device(
     with pytest.warns(UserWarning, match="s4"):
         result = fit_recording(recording)
     assert result.report.dropped_channels == (4,) and result.model.gain_q12[4] == 0
+    assert result.model.channels == 6  # a dropped channel keeps its place: the board still has six
     gaze = np.random.default_rng(0).uniform(-19, 19, (500, 2))
     features = eye.features(gaze, np.random.default_rng(1)).astype(np.uint16)
     answers = []
@@ -235,6 +237,34 @@ def test_one_fixation_100_sigma_off_is_left_out_and_named(fitted, quick):
     assert len(result.report.outliers) >= 1
     np.testing.assert_allclose(result.report.outliers[0], recording.target_deg[0])
     assert errors(result.model, fitted[0])[0].mean() < 0.4
+
+
+def test_a_recording_that_does_not_depend_on_its_targets_warns_and_an_ordinary_one_does_not(quick):
+    recording = Eye(0).recording(targets=49)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert fit_recording(recording, n_vectors=8).report.loo_rms_deg < module.LOO_DOUBTFUL_DEG
+    places, label = np.unique(recording.target_deg, axis=0, return_inverse=True)
+    recording.target_deg = np.random.default_rng(0).permutation(places)[label.reshape(-1)]
+    with pytest.warns(UserWarning, match="says little about where the eye looked"):
+        assert fit_recording(recording, n_vectors=8).report.loo_rms_deg > module.LOO_DOUBTFUL_DEG
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_half_or_twice_the_assumed_bias_of_the_eye_changes_the_held_out_error_by_less_than_3_percent(
+    seed, quick, monkeypatch
+):
+    eye, gaze = Eye(seed), np.random.default_rng(seed).uniform(-19, 19, (2000, 2))
+    features = eye.features(gaze, np.random.default_rng(10 + seed))
+    recording = eye.recording(seed, bias=0.4)
+    mean, scales = [], []
+    for bias_deg in (0.15, 0.3, 0.6):
+        monkeypatch.setattr(fixations_module, "BIAS_DEG", bias_deg)
+        scales.append(fixations(recording).noise_scale().mean())
+        gp = fit_recording(recording, n_vectors=8).gp
+        mean.append(frame_errors_deg(*gp.predict(features).T, *gaze.T).mean())
+    assert scales[0] > scales[1] > scales[2]  # it does reach the fit
+    assert max(mean) < 1.03 * min(mean) and max(mean) < 0.4
 
 
 def test_unmarked_blinks_within_fixations_are_left_out(fitted, quick):
@@ -270,6 +300,7 @@ def test_fewer_targets_than_needed_are_refused_with_the_number(targets):
     assert str(TARGETS_NEEDED) in caught.value.remedy and f"{targets} targets" in caught.value.message
 
 
+@pytest.mark.filterwarnings("ignore:targets that are left out")  # few of them, or few channels
 @pytest.mark.parametrize("each", [1, 3])
 def test_nine_points_are_enough_for_a_finite_model(each, quick):
     recording = Eye(0).recording(targets=9, frames=each)
@@ -307,6 +338,7 @@ def test_channels_of_very_different_scale(quick):
     assert frame_errors_deg(az, el, *gaze.T).mean() < 0.7
 
 
+@pytest.mark.filterwarnings("ignore:targets that are left out")  # few of them, or few channels
 @pytest.mark.parametrize("d", [2, 3, 5])
 def test_fewer_channels_than_six(d, quick):
     recording = Eye(0).recording()
