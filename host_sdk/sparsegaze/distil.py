@@ -327,8 +327,8 @@ def fit_recording(recording, n_vectors=64, seed=0):
     loo_rms_deg = float(np.sqrt(np.mean(np.sum((learnt.y - learnt.loo()[0]) ** 2, axis=1))))
     if loo_rms_deg > LOO_DOUBTFUL_DEG:
         warnings.warn(
-            f"targets that are left out are missed by {loo_rms_deg:.1f} deg: this recording says little about "
-            "where the eye looked; check the headset's seat and record again, with more targets"
+            f"targets that are left out are missed by {loo_rms_deg:.1f} deg: this recording says little "
+            "about where the eye looked; check the headset's seat and record again, with more targets"
         )
     rows = _thin(fixed.frames(max(1, min(FRAMES_EACH, ROWS_MAX // len(fixed.mean)))), ROWS_MAX)
     with warnings.catch_warnings():

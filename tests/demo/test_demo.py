@@ -21,7 +21,8 @@ from sparsegaze.mapfile import synthetic_map
 KEYS = """
 setup_s total_s seed flash.bytes flash.verified flash.seconds model.n_vectors model.crc_host model.crc_device
 stream.seconds stream.rate_hz stream.frames stream.lost stream.bit_identical
-accuracy.mean_deg accuracy.median_deg accuracy.p95_deg accuracy.accuracy_deg accuracy.rms_s2s_deg accuracy.data_loss accuracy.to_true_gaze_mean_deg
+accuracy.mean_deg accuracy.median_deg accuracy.p95_deg accuracy.accuracy_deg accuracy.rms_s2s_deg
+accuracy.data_loss accuracy.to_true_gaze_mean_deg
 accuracy.gp64_mean_deg inference.cycles frame.cycles latency_ms.mean_sample_to_last_byte
 latency_ms.last_sample_to_last_byte
 """.split()
@@ -87,7 +88,7 @@ def log(path, *events):
 
 
 def frame(at, first, second):
-    """One frame from cycle `at`: its last sample is read 54400 later, its packets end `first`, `second` later."""
+    """One frame from cycle `at`: its last sample is read 54400 later, the packets end at +first, +second."""
     return [("release", at), ("sample", at + 54_400), ("delimiter", at + first), ("delimiter", at + second)]
 
 

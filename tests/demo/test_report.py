@@ -25,8 +25,9 @@ def tool(monkeypatch, tmp_path, good):
 def test_table_shows_the_figures_of_the_report(good):
     table = module.table(good)
     assert "simulated person 1" in table and "**0.70** / 0.60 / 1.50 deg" in table
-    for figure in ("260.4 Hz", "6510, 0, 0", "64 vectors", "15,900, 24,700 of 61,440 cycles", "4.10 ms, 2.50 ms"):
+    for figure in ("260.4 Hz", "6510, 0, 0", "64 vectors", "15,900, 24,700 of 61,440 cycles"):
         assert figure in table
+    assert "4.10 ms, 2.50 ms" in table
     assert {line.count("|") for line in table.splitlines()} == {4}
 
 
