@@ -60,6 +60,8 @@ def stream(port, seconds, csv, as_json):
         f"{data['frames']} frames in {data['seconds']:.1f} s ({data['rate_hz']:.1f} Hz), "
         f"{data['lost']} lost, {data['valid_percent']:.1f} % valid"
     )
+    if tally.frames and tally.without_model == tally.frames:
+        text += f"\nthe device has no model: run `sparsegaze calibrate {port}`"
     if csv == "-":
         console.note(text)
     else:

@@ -2,6 +2,7 @@
 """A gaze stream as it arrives: counted, shown, kept."""
 
 from .gazefile import GazeCsv
+from .wire import lib
 
 
 class Tally:
@@ -11,6 +12,7 @@ class Tally:
         self.frames = self.valid = self.lost = self.incomplete = self.bad = 0
         self.first_us = self.last_us = None
         self.gaze = None  # the latest, valid or not
+        self.without_model = 0
         self.clock_drift = 0.0
 
     def add(self, frame, device):
@@ -20,6 +22,7 @@ class Tally:
         self.last_us = frame.t_us
         self.gaze = frame.gaze
         self.valid += frame.gaze is not None and frame.gaze.valid
+        self.without_model += frame.gaze is not None and bool(frame.gaze.flags & lib.SG_FLAG_NO_MODEL)
         self.lost, self.incomplete, self.bad = device.lost, device.incomplete, device.bad
         self.clock_drift = device.clock.drift
 
@@ -40,7 +43,8 @@ class Tally:
         elif self.gaze.valid:
             where = f"azimuth {self.gaze.azimuth_deg:+7.2f}  elevation {self.gaze.elevation_deg:+7.2f} deg"
         else:
-            where = "no valid gaze (blink, or not calibrated)".ljust(42)
+            why = "the device has no model" if self.without_model == self.frames else "blink, or a headset that moved"
+            where = f"no valid gaze ({why})".ljust(42)
         return f"{where}   {self.rate_hz:6.1f} Hz   {self.seconds:7.1f} s   lost {self.lost}"
 
     def report(self):
