@@ -48,7 +48,8 @@ def test_impossible_geometry_is_refused_with_the_options_to_correct(distance_mm,
 
 @pytest.fixture
 def window(monkeypatch):
-    pytest.importorskip("pygame")
+    import pygame  # noqa: F401  (make setup installs it: missing is a failure)
+
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     shown = WindowScreen(distance_mm=600, width_mm=900, full_screen=False, size=(1280, 960))
     yield shown
@@ -129,7 +130,8 @@ def test_escape_and_closing_the_window_interrupt(window, what):
 
 
 def test_no_display_is_one_line_with_a_remedy(monkeypatch):
-    pytest.importorskip("pygame")
+    import pygame  # noqa: F401  (make setup installs it: missing is a failure)
+
     monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")
     with pytest.raises(CalibrationError, match="no screen"):
         WindowScreen()

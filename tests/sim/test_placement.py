@@ -93,7 +93,6 @@ def test_an_aim_is_turned_and_read_back(placement, led2gaze):
 
 
 def test_a_map_is_drawn_with_a_panel_per_sensor_and_one_of_the_placement(led2gaze, headset_path, tmp_path):
-    pytest.importorskip("matplotlib")
     from matplotlib.figure import Figure
 
     from sparsegaze.mapplot import draw_maps, save_maps

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The core on a simulated ATmega328P: the same bits as on the host, and what they cost."""
 import re
-import shutil
 import zlib
 
 import numpy as np
@@ -12,7 +11,6 @@ from core_models import Parts, View, features_near, random_parts
 from sparsegaze._core import ffi, lib
 from test_core_gp import GOLDEN_CRC, golden_case
 
-pytestmark = pytest.mark.skipif(not avr.avr_tool("avr-gcc") or not shutil.which("gcc"), reason="no avr-gcc")
 TWINS = {"assembly": (), "portable": ("SG_GP_PORTABLE",)}
 
 # Net cycles at 64 vectors, 6 channels, 4 guards, all kernels in range. A change of either sign is worth a

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from sparsegaze import model as m
+from sparsegaze._core import ffi, lib
 from sparsegaze.errors import ModelError
 from sparsegaze.model import DeviceModel, emulate
-
-ffi, lib = pytest.importorskip("sparsegaze._core").ffi, pytest.importorskip("sparsegaze._core").lib
 
 
 def parts(seed=0, n=64, d=6, bits=8, guards=3, gain_top=4096):
