@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The terms that vary slowly with gaze: sclera over the lids' opening (from margin to margin, in the head
-// frame), iris over rings between pupil edges (in the eye frame, light in and out through the cornea), skin
-// over the face.
+// frame), iris over rings between pupil edges (in the eye frame, light in and out through the cornea).
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
@@ -29,7 +28,7 @@ void sim_add_pairs(const struct sim_scene *scene, double weight, const double *s
 }
 
 // Both ends' factors at one place: the site's transfer times each port's window.
-static void ports_at(const struct sim_scene *scene, const double *transfer, double (*away)[3],
+void sim_ports_at(const struct sim_scene *scene, const double *transfer, double (*away)[3],
                      double *sensor_part, double *emitter_part) {
     for (int s = 0; s < scene->n_sensors; ++s) {
         int k = scene->sensors[s].site;
@@ -50,7 +49,7 @@ static double lens_cosine(double cosine, double half_angle) {
 }
 
 // Irradiance per intensity at a surface point, and the unit vector to the site.
-static double surface_transfer(const struct sim_site *site, const double point[3], const double normal[3],
+double sim_surface_transfer(const struct sim_site *site, const double point[3], const double normal[3],
                                double away[3], double *distance) {
     double d[3] = {site->position[0] - point[0], site->position[1] - point[1], site->position[2] - point[2]};
     double n2 = sim_dot(d, d), n = sqrt(n2);
@@ -83,18 +82,17 @@ static double past_cornea(const struct sim_scene *scene, const double point[3], 
 
 static void add_sclera(const struct sim_scene *scene, const double axes[9], double elevation_deg,
                        double opening, double *out) {
-    const struct sim_quality *q = &scene->quality;
     const struct sim_eye *eye = &scene->eye;
     struct sim_lid lid;
     sim_lid_pose(&lid, &scene->person, elevation_deg, opening);
     double axis[3] = {axes[2], axes[5], axes[8]};
     double albedo = scene->person.albedo_sclera / PI;
-    for (int i = 0; i < q->lid_alpha; ++i) {
+    for (int i = 0; i < scene->gauss_nodes[0]; ++i) {
         double alpha = lid.half * scene->gauss[0][i], upper, lower;
         sim_lid_margins(&lid, alpha, &upper, &lower);
         if (upper <= lower) continue;
         double sa = sin(alpha), ca = cos(alpha);
-        for (int j = 0; j < q->lid_beta; ++j) {
+        for (int j = 0; j < scene->gauss_nodes[1]; ++j) {
             double beta = (upper + lower) / 2 + (upper - lower) / 2 * scene->gauss[1][j];
             double sb = sin(beta), cb = cos(beta);
             struct sim_lid_point at = {.radial = {sa * cb, sb, -ca * cb}, .up = {-sa * sb, cb, ca * sb}};
@@ -117,7 +115,7 @@ static void add_sclera(const struct sim_scene *scene, const double axes[9], doub
             sim_lid_measure(&lid, alpha, beta, rho, &at);
             int lit = 0;
             for (int k = 0; k < scene->n_sites; ++k) {
-                double distance, t = surface_transfer(&scene->sites[k], point, normal, away[k], &distance);
+                double distance, t = sim_surface_transfer(&scene->sites[k], point, normal, away[k], &distance);
                 if (t > 0) t *= sim_lid_open_toward(&lid, &at, away[k]);
                 if (t > 0) t *= past_cornea(scene, point, axis, away[k], distance, scene->sites[k].radius);
                 if (t > 0) t *= sim_face_eye_reach(&scene->face, k, alpha, beta);
@@ -126,9 +124,9 @@ static void add_sclera(const struct sim_scene *scene, const double axes[9], doub
             }
             if (!lit) continue;
             double sensor_part[SIM_MAX_PORTS], emitter_part[SIM_MAX_PORTS];
-            ports_at(scene, transfer, away, sensor_part, emitter_part);
-            double weight = lid.half * scene->gauss[0][q->lid_alpha + i] * (upper - lower) / 2 *
-                            scene->gauss[1][q->lid_beta + j] * cb * rho * length;
+            sim_ports_at(scene, transfer, away, sensor_part, emitter_part);
+            double weight = lid.half * scene->gauss[0][scene->gauss_nodes[0] + i] * (upper - lower) / 2 *
+                            scene->gauss[1][scene->gauss_nodes[1] + j] * cb * rho * length;
             sim_add_pairs(scene, weight * albedo * white, sensor_part, emitter_part, out);
         }
     }
@@ -156,7 +154,7 @@ static void add_iris_spot(const struct sim_scene *scene, const double axes[9], c
         transfer[k] *= sim_face_eye_reach(&scene->face, k, alpha[k], beta[k]);
     }
     double sensor_all[SIM_MAX_PORTS], emitter_all[SIM_MAX_PORTS];
-    ports_at(scene, transfer, away, sensor_all, emitter_all);
+    sim_ports_at(scene, transfer, away, sensor_all, emitter_all);
     for (int l = 0; l < n_lids; ++l) {
         double open[2 * SIM_MAX_PORTS], sensor_part[SIM_MAX_PORTS], emitter_part[SIM_MAX_PORTS];
         for (int k = 0; k < scene->n_sites; ++k) {
@@ -178,8 +176,8 @@ static void add_iris_spot(const struct sim_scene *scene, const double axes[9], c
 static int add_iris(const struct sim_scene *scene, const double axes[9], double elevation_deg,
                     const double *pupil_mm, int n_pupils, const double *lid_opening, int n_lids,
                     double *out) {
-    const struct sim_quality *q = &scene->quality;
     const struct sim_eye *eye = &scene->eye;
+    int around = (int)ceil(64 * scene->quality.iris);
     int block = n_lids * scene->n_sensors * scene->n_emitters;
     struct sim_lid lids[SIM_MAX_LIDS];
     double sites_eye[2 * SIM_MAX_PORTS][3], *ring = malloc((size_t)block * sizeof *ring);
@@ -189,7 +187,7 @@ static int add_iris(const struct sim_scene *scene, const double axes[9], double 
     double albedo = scene->person.albedo_iris / (PI * eye->index * eye->index);
     memset(ring, 0, (size_t)block * sizeof *ring);
     for (int p = n_pupils - 1; p >= 0; --p) {
-        int last = p == n_pupils - 1, n = last ? q->iris_edge : q->iris_ring;
+        int last = p == n_pupils - 1, n = last ? scene->gauss_nodes[3] : scene->gauss_nodes[2];
         const double *gauss = scene->gauss[last ? 3 : 2];
         double from = pupil_mm[p] / 2, to = last ? eye->limbus : pupil_mm[p + 1] / 2;
         // The edge nodes are meant for the outermost 2 mm or so, where the cornea ends.
@@ -197,9 +195,9 @@ static int add_iris(const struct sim_scene *scene, const double axes[9], double 
         double half = (to - from) / (2 * panels);
         for (int i = 0; i < n * panels; ++i) {
             double r = from + half * (2 * (i / n) + 1 + gauss[i % n]);
-            double weight = half * gauss[n + i % n] * r * 2 * PI / q->iris_phi * albedo;
-            for (int j = 0; j < q->iris_phi; ++j) {
-                double phi = 2 * PI * (j + 0.5) / q->iris_phi;
+            double weight = half * gauss[n + i % n] * r * 2 * PI / around * albedo;
+            for (int j = 0; j < around; ++j) {
+                double phi = 2 * PI * (j + 0.5) / around;
                 double spot[3] = {r * cos(phi), r * sin(phi), eye->iris_z};
                 add_iris_spot(scene, axes, (const double (*)[3])sites_eye, spot, weight, lids, n_lids, ring);
             }
@@ -207,53 +205,6 @@ static int add_iris(const struct sim_scene *scene, const double axes[9], double 
         for (int k = 0; k < block; ++k) out[(size_t)p * (size_t)block + (size_t)k] += ring[k];
     }
     free(ring);
-    return 0;
-}
-
-static void add_face(const struct sim_scene *scene, double elevation_deg, double opening, double *out) {
-    int pairs = scene->n_sensors * scene->n_emitters;
-    struct sim_lid lid;
-    sim_lid_pose(&lid, &scene->person, elevation_deg, opening);
-    for (int k = 0; k < pairs; ++k) out[k] += scene->face_all[k];
-    for (int i = 0; i < scene->n_lid_spots; ++i) {
-        const struct sim_spot *spot = &scene->face.spots[scene->lid_spots[i]];
-        struct sim_lid_point at;
-        sim_lid_measure(&lid, spot->alpha, spot->beta, spot->rho, &at);
-        if (at.above <= 0 || at.below <= 0) continue;
-        double open = sim_lid_open(&lid, &at);
-        const double *part = scene->face_spots + (size_t)i * (size_t)(scene->n_sensors + scene->n_emitters);
-        sim_add_pairs(scene, -open, part, part + scene->n_sensors, out);
-    }
-}
-
-int sim_prepare_face(struct sim_scene *scene) {
-    struct sim_face *face = &scene->face;
-    size_t pairs = (size_t)(scene->n_sensors * scene->n_emitters);
-    size_t ports = (size_t)(scene->n_sensors + scene->n_emitters);
-    for (int i = 0; i < face->n_spots; ++i) scene->n_lid_spots += face->spots[i].lid;
-    scene->face_all = calloc(pairs, sizeof(double));
-    scene->face_spots = calloc(ports * (size_t)scene->n_lid_spots + 1, sizeof(double));
-    scene->lid_spots = calloc((size_t)scene->n_lid_spots + 1, sizeof(int));
-    if (!scene->face_all || !scene->face_spots || !scene->lid_spots) return -1;
-    double albedo = scene->person.albedo_skin / PI;
-    for (int i = 0, lid = 0; i < face->n_spots; ++i) {
-        const struct sim_spot *spot = &face->spots[i];
-        double transfer[2 * SIM_MAX_PORTS], away[2 * SIM_MAX_PORTS][3], normal[3], distance;
-        double area = sqrt(sim_dot(spot->area, spot->area)), sensor_part[SIM_MAX_PORTS],
-               emitter_part[SIM_MAX_PORTS];
-        for (int k = 0; k < 3; ++k) normal[k] = spot->area[k] / area;
-        for (int k = 0; k < scene->n_sites; ++k) {
-            transfer[k] = surface_transfer(&scene->sites[k], spot->position, normal, away[k], &distance);
-            transfer[k] *= face->reach[i * face->n_sites + k];
-        }
-        ports_at(scene, transfer, away, sensor_part, emitter_part);
-        sim_add_pairs(scene, albedo * area, sensor_part, emitter_part, scene->face_all);
-        if (!spot->lid) continue;
-        double *keep = scene->face_spots + (size_t)lid * ports;
-        for (int k = 0; k < scene->n_sensors; ++k) keep[k] = albedo * area * sensor_part[k];
-        memcpy(keep + scene->n_sensors, emitter_part, (size_t)scene->n_emitters * sizeof *keep);
-        scene->lid_spots[lid++] = i;
-    }
     return 0;
 }
 
@@ -278,7 +229,7 @@ int sim_scene_smooth(const struct sim_scene *scene, double azimuth_deg, double e
     sim_eye_orient(&scene->eye, azimuth_deg, elevation_deg, axes);
     memset(out, 0, (size_t)n_pupils * block * sizeof *out);
     for (int l = 0; l < n_lids; ++l) {
-        if (terms & SIM_TERM_FACE) add_face(scene, elevation_deg, lid_opening[l], out + (size_t)l * pairs);
+        if (terms & SIM_TERM_FACE) sim_add_face(scene, elevation_deg, lid_opening[l], out + (size_t)l * pairs);
         if (terms & SIM_TERM_SCLERA)
             add_sclera(scene, axes, elevation_deg, lid_opening[l], out + (size_t)l * pairs);
     }

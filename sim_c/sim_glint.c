@@ -114,7 +114,7 @@ static void add_point(const struct pair_view *view, const struct ring *ring, dou
 }
 
 static void add_pair(const struct pair_view *view, const struct ring *rings, int n_rings) {
-    double alpha = sqrt(view->alpha2), phi = 0, step_widths = view->scene->quality.glint_lobe;
+    double alpha = sqrt(view->alpha2), phi = 0, step_widths = 1 / view->scene->quality.glint;
     double mid[3] = {view->a[0] + view->b[0], view->a[1] + view->b[1], view->a[2] + view->b[2]};
     double start = atan2(mid[1], mid[0]);
     for (int i = 0; i < n_rings; ++i) {
@@ -158,7 +158,7 @@ int sim_scene_glint(const struct sim_scene *scene, double azimuth_deg, double el
         away[k] = sqrt(sim_dot(scene->sites[k].position, scene->sites[k].position)) - scene->eye.apex;
         if (away[k] < nearest) nearest = away[k];
     }
-    double step = scene->quality.glint_theta_deg * SIM_RADIANS;
+    double step = 0.5 / scene->quality.glint * SIM_RADIANS;
     if (nearest < scene->eye.apex) step *= nearest / scene->eye.apex;  // half vectors turn faster near a site
     if (step < 2e-5) step = 2e-5;
     int n_rings = (int)ceil(THETA_END / step);

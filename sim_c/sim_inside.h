@@ -30,6 +30,7 @@ struct sim_scene {
     struct sim_window sensors[SIM_MAX_PORTS], emitters[SIM_MAX_PORTS];
     double *nodes;  // Gauss-Legendre abscissas on -1..1 and weights: alpha, beta, iris ring, iris edge
     const double *gauss[4];
+    int gauss_nodes[4];
     double *face_all;    // [sensors][emitters] response of all skin with the lids closed
     double *face_spots;  // [n_lid_spots][sensors + emitters], of what an open eye may replace
     int *lid_spots, n_lid_spots;
@@ -42,6 +43,18 @@ double sim_window_weight(const struct sim_window *window, const double away[3]);
 // site.
 void sim_add_pairs(const struct sim_scene *scene, double weight, const double *sensor_part,
                    const double *emitter_part, double *out);
+
+// Both ends' factors at one place: each site's transfer times each port's window. away: unit vectors to the
+// sites, used where transfer is not 0.
+void sim_ports_at(const struct sim_scene *scene, const double *transfer, double (*away)[3],
+                  double *sensor_part, double *emitter_part);
+
+// Irradiance per intensity at a surface point (unit normal), the unit vector to the site and its distance.
+double sim_surface_transfer(const struct sim_site *site, const double point[3], const double normal[3],
+                            double away[3], double *distance);
+
+// out[sensors][emitters] += the skin's term at one lid pose.
+void sim_add_face(const struct sim_scene *scene, double elevation_deg, double opening, double *out);
 
 // Factors of every spot of the face, from its visibility. Returns 0, or -1 for lack of memory.
 int sim_prepare_face(struct sim_scene *scene);

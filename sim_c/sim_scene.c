@@ -9,14 +9,7 @@
 #define PI 3.14159265358979323846
 
 struct sim_quality sim_quality_default(void) {
-    struct sim_quality q = {.lid_alpha = 96,
-                            .lid_beta = 56,
-                            .iris_ring = 3,
-                            .iris_edge = 18,
-                            .iris_phi = 64,
-                            .glint_theta_deg = 0.5,
-                            .glint_lobe = 1.0,
-                            .face_step_mm = 0.2};
+    struct sim_quality q = {.sclera = 1, .iris = 1, .glint = 1, .face = 1, .tolerance = 0};
     return q;
 }
 
@@ -123,21 +116,25 @@ static int add_ports(struct sim_scene *scene, const struct sim_port *ports, int 
 
 static int prepare(struct sim_scene *scene, char *error, size_t bytes) {
     const struct sim_quality *q = &scene->quality;
-    int n[4] = {q->lid_alpha, q->lid_beta, q->iris_ring, q->iris_edge}, total = 0;
+    const double fineness[4] = {q->sclera, q->iris, q->glint, q->face};
+    for (int i = 0; i < 4; ++i)
+        if (!(fineness[i] >= 0.1 && fineness[i] <= 16))
+            return refuse(error, bytes, "quality out of range 0.1..16");
+    if (!(q->tolerance >= 0 && q->tolerance < 1)) return refuse(error, bytes, "tolerance out of range");
+    const int counts[4] = {96, 56, 3, 18};  // alpha, beta, iris ring, iris edge
+    int total = 0;
     for (int i = 0; i < 4; ++i) {
-        if (n[i] < 2 || n[i] > 2000) return refuse(error, bytes, "quality out of range");
-        total += 2 * n[i];
+        int n = (int)ceil(counts[i] * (i < 2 ? q->sclera : q->iris));
+        scene->gauss_nodes[i] = n < 2 ? 2 : n;
+        total += 2 * scene->gauss_nodes[i];
     }
-    if (!(q->iris_phi >= 8 && q->iris_phi <= 4096 && q->glint_theta_deg > 0.005 && q->glint_theta_deg < 5 &&
-          q->glint_lobe > 0.02 && q->glint_lobe < 3 && q->face_step_mm >= 0.05 && q->face_step_mm <= 4))
-        return refuse(error, bytes, "quality out of range");
     if (!(scene->nodes = malloc((size_t)total * sizeof(double))))
         return refuse(error, bytes, "out of memory");
     double *at = scene->nodes;
     for (int i = 0; i < 4; ++i) {
-        gauss_legendre(n[i], at);
+        gauss_legendre(scene->gauss_nodes[i], at);
         scene->gauss[i] = at;
-        at += 2 * n[i];
+        at += 2 * scene->gauss_nodes[i];
     }
     double sites[2 * SIM_MAX_PORTS][3], radius[2 * SIM_MAX_PORTS];
     for (int k = 0; k < scene->n_sites; ++k) {
@@ -145,7 +142,7 @@ static int prepare(struct sim_scene *scene, char *error, size_t bytes) {
         radius[k] = scene->sites[k].radius;
     }
     if (sim_face_open(&scene->face, &scene->person, (const double (*)[3])sites, radius, scene->n_sites,
-                      q->face_step_mm, error, bytes))
+                      0.2 / q->face, error, bytes))
         return -1;
     return sim_prepare_face(scene) ? refuse(error, bytes, "out of memory") : 0;
 }

@@ -60,14 +60,7 @@ BIAS_DEG = 0.3
 FRAMES_PER_FIXATION = 40
 FEATURE_STEPS = 4096  # per octave, as the device sends
 # Coarser than a map: its error of about 1e-3 is smooth and the same for every placement.
-QUICK = {
-    "lid_alpha": 40,
-    "lid_beta": 32,
-    "iris_edge": 10,
-    "iris_phi": 40,
-    "face_step_mm": 0.5,
-    "glint_theta_deg": 0.6,
-}
+QUICK = {"sclera": 0.5, "iris": 0.55, "face": 0.4, "glint": 0.9}
 
 
 def channels(response):

@@ -16,7 +16,16 @@ from cffi import FFI
 HERE = os.path.dirname(os.path.abspath(__file__))
 SIM_C = os.path.normpath(os.path.join(HERE, "..", "..", "sim_c"))
 HEADERS = ("sim_map.h", "sim_eye.h", "sim_scene.h")
-SOURCES = ("sim_map.c", "sim_eye.c", "sim_lid.c", "sim_face.c", "sim_diffuse.c", "sim_glint.c", "sim_scene.c")
+SOURCES = (
+    "sim_map.c",
+    "sim_eye.c",
+    "sim_lid.c",
+    "sim_face.c",
+    "sim_skin.c",
+    "sim_diffuse.c",
+    "sim_glint.c",
+    "sim_scene.c",
+)
 
 
 def cdef_regions():

@@ -21,7 +21,7 @@ TINY = dict(
     glint_nodes=4,
     pupil_mm=(3.5,),
     lid_opening=(0.0, 1.0),
-    quality={"face_step_mm": 1.0, "lid_alpha": 16, "lid_beta": 16, "iris_phi": 16}.items(),
+    quality={"face": 0.2, "sclera": 0.2, "iris": 0.25}.items(),
 )
 
 

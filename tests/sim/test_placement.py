@@ -97,7 +97,7 @@ def test_a_map_is_drawn_with_a_panel_per_sensor_and_one_of_the_placement(led2gaz
 
     from sparsegaze.mapplot import draw_maps, save_maps
 
-    rough = {"face_step_mm": 1.0, "lid_alpha": 16, "lid_beta": 16, "iris_phi": 16}
+    rough = {"face": 0.2, "sclera": 0.2, "iris": 0.25}
     grid = Grid(
         half_angle_deg=20, smooth_nodes=5, glint_nodes=5, pupil_mm=(3.5,), lid_opening=(1.0,), quality=rough
     )

@@ -108,7 +108,7 @@ def test_glint_of_a_single_sphere_is_the_closed_form_to_second_order_in_roughnes
     error = []
     for alpha in (0.04, 0.02, 0.01):
         scene = Scene(
-            pair(sensor, emitter), replace(SPHERE, roughness=alpha), quality={"glint_theta_deg": 0.05}
+            pair(sensor, emitter), replace(SPHERE, roughness=alpha), quality={"glint": 10}
         )
         error.append(abs(scene.glint(0, 0, 1.0)[0, 0, 0] / exact - 1))
     assert error[2] < 1e-3
@@ -133,7 +133,7 @@ def test_a_very_large_cornea_is_a_flat_mirror():
     person = replace(SPHERE, roughness=0.01, lid_radius_mm=1205.0, **grow)
     apex = simulator()[1].sim_person_profile_mm(c_person(simulator()[0], person), 0.0)
     sensor, emitter = (port((x, 0.0, -apex - 10.0), (0, 0, -apex), 60.0, 0.0) for x in (-3.0, 3.0))
-    scene = Scene(pair(sensor, emitter), person, quality={"glint_theta_deg": 0.05, "glint_lobe": 0.05})
+    scene = Scene(pair(sensor, emitter), person, quality={"glint": 10})
     cosine = 10 / np.hypot(3, 10)
     flat = fresnel(person.refractive_index, cosine) / (4 * (9 + 100)) * window(sensor, (0, 0, -apex)) ** 2
     got = scene.glint(0, 0, 1.0)[0, 0, 0]
@@ -178,16 +178,7 @@ def test_no_more_light_comes_back_than_was_emitted():
 @pytest.mark.parametrize("seed", range(3))
 def test_finer_integration_changes_less_than_a_thousandth(seed):
     rng = np.random.default_rng(seed)
-    fine = {
-        "lid_alpha": 200,
-        "lid_beta": 160,
-        "iris_ring": 8,
-        "iris_edge": 40,
-        "iris_phi": 200,
-        "glint_theta_deg": 0.1,
-        "glint_lobe": 0.4,
-        "face_step_mm": 0.15,
-    }
+    fine = {"sclera": 2.5, "iris": 2.5, "glint": 5, "face": 1.4}
     default, finer = Scene(six(), draw_person(seed)), Scene(six(), draw_person(seed), quality=fine)
     error, mean = [], []
     for _ in range(5):
@@ -272,7 +263,7 @@ def test_nearly_all_of_the_signal_is_diffuse_and_the_pupil_darkens_it():
 
 
 def test_pupils_computed_together_equal_pupils_computed_alone():
-    scene = Scene(six(), Person(), quality={"iris_ring": 10, "iris_edge": 40})
+    scene = Scene(six(), Person(), quality={"iris": 3})
     together = scene.smooth(4, -6, [2.5, 3.5, 5.0], [0.7, 1.0])
     for i, pupil in enumerate((2.5, 3.5, 5.0)):
         for j, lid in enumerate((0.7, 1.0)):
