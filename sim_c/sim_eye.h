@@ -29,6 +29,8 @@ struct sim_person {
     double lid_thickness_mm;            // height of the margin above the eye: hides what lies behind it
     double lid_softness_mm;             // rounding of the margin: width of its edge in light
     double lid_radius_mm;               // of the lids' outer surface about the centre of rotation
+    double lash_length_mm;              // how far the upper lashes stand off the eye, above their margin
+    double lash_opacity;                // share of the light that is lost in their fan; 0 = no lashes
     double brow_mm, nose_mm, cheek_mm;  // how far these stand forward of the orbital plane
     double eye_position_mm[3];          // of the centre of rotation in the headset's frame
 };

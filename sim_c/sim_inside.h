@@ -20,6 +20,8 @@ struct sim_window {
     double aim[3], per_tan2;  // 1 / (2 tan^2 sigma)
 };
 
+enum { SIM_MAX_RULE = 24 };
+
 struct sim_scene {
     struct sim_person person;
     struct sim_quality quality;
@@ -31,6 +33,7 @@ struct sim_scene {
     double *nodes;  // Gauss-Legendre abscissas on -1..1 and weights: alpha, beta, iris ring, iris edge
     const double *gauss[4];
     int gauss_nodes[4];
+    const double *rule[SIM_MAX_RULE + 1];  // rule[n]: Gauss-Legendre's n abscissas on -1..1, n weights
     double *face_all;    // [sensors][emitters] response of all skin with the lids closed
     double *face_spots;  // [n_lid_spots][sensors + emitters], of what an open eye may replace
     int *lid_spots, n_lid_spots;

@@ -16,6 +16,8 @@ void sim_lid_pose(struct sim_lid *lid, const struct sim_person *person, double e
     lid->tilt = person->canthus_tilt_deg / 45;
     lid->thickness = person->lid_thickness_mm;
     lid->softness = person->lid_softness_mm;
+    lid->lash_length = person->lash_length_mm;
+    lid->lash_opacity = person->lash_opacity;
 }
 
 void sim_lid_margins(const struct sim_lid *lid, double alpha, double *upper, double *lower) {
@@ -59,6 +61,9 @@ double sim_lid_open_toward(const struct sim_lid *lid, const struct sim_lid_point
     // normal.
     double size = sqrt(tangent * tangent + 0.01);
     double to_upper = lid->thickness * (size + tangent) / 2, to_lower = lid->thickness * (size - tangent) / 2;
-    return sim_step((point->above - to_upper) / lid->softness) *
-           sim_step((point->below - to_lower) / lid->softness);
+    double open = sim_step((point->above - to_upper) / lid->softness) *
+                  sim_step((point->below - to_lower) / lid->softness);
+    if (lid->lash_opacity == 0) return open;
+    double to_lash = lid->lash_length * (size + tangent) / 2;
+    return open * (1 - lid->lash_opacity * (1 - sim_step((point->above - to_lash) / lid->softness)));
 }

@@ -13,6 +13,7 @@ struct sim_lid {
     double upper, lower;  // elevation of the margins at alpha = 0
     double half, tilt;    // canthi at +-half; both curves rise by tilt * alpha
     double thickness, softness;
+    double lash_length, lash_opacity;
 };
 
 // A point as the lids see it.
@@ -37,7 +38,8 @@ void sim_lid_measure(const struct sim_lid *lid, double alpha, double beta, doubl
 // How open the lids are at the point, 0..1, seen straight on.
 double sim_lid_open(const struct sim_lid *lid, const struct sim_lid_point *point);
 
-// The same seen along a unit vector (from the point): a margin stands lid_thickness_mm off the eye.
+// The same seen along a unit vector (from the point): a margin stands lid_thickness_mm off the eye, and the
+// upper lashes dim, by lash_opacity, what a margin of lash_length_mm instead would hide. Closed lids hide all.
 double sim_lid_open_toward(const struct sim_lid *lid, const struct sim_lid_point *point,
                            const double toward[3]);
 

@@ -64,6 +64,8 @@ static int check_person(const struct sim_person *p, char *error, size_t bytes) {
           p->lid_close_at >= 0 && p->lid_close_at <= 1 && p->lid_thickness_mm >= 0 &&
           p->lid_softness_mm > 0 && fabs(p->lid_upper_deg) < 60 && fabs(p->lid_lower_deg) < 60))
         return refuse(error, bytes, "the lids' shape is impossible");
+    if (!(p->lash_length_mm >= 0 && p->lash_length_mm <= 15 && p->lash_opacity >= 0 && p->lash_opacity <= 1))
+        return refuse(error, bytes, "lashes are 0..15 mm long and of opacity 0..1");
     if (!(p->lid_radius_mm > p->globe_radius_mm))
         return refuse(error, bytes, "the lids lie inside the globe");
     return 0;
@@ -122,7 +124,7 @@ static int prepare(struct sim_scene *scene, char *error, size_t bytes) {
             return refuse(error, bytes, "quality out of range 0.1..16");
     if (!(q->tolerance >= 0 && q->tolerance < 1)) return refuse(error, bytes, "tolerance out of range");
     const int counts[4] = {96, 56, 3, 18};  // alpha, beta, iris ring, iris edge
-    int total = 0;
+    int total = SIM_MAX_RULE * (SIM_MAX_RULE + 1);
     for (int i = 0; i < 4; ++i) {
         int n = (int)ceil(counts[i] * (i < 2 ? q->sclera : q->iris));
         scene->gauss_nodes[i] = n < 2 ? 2 : n;
@@ -131,6 +133,10 @@ static int prepare(struct sim_scene *scene, char *error, size_t bytes) {
     if (!(scene->nodes = malloc((size_t)total * sizeof(double))))
         return refuse(error, bytes, "out of memory");
     double *at = scene->nodes;
+    for (int n = 1; n <= SIM_MAX_RULE; at += 2 * n++) {
+        gauss_legendre(n, at);
+        scene->rule[n] = at;
+    }
     for (int i = 0; i < 4; ++i) {
         gauss_legendre(scene->gauss_nodes[i], at);
         scene->gauss[i] = at;

@@ -13,7 +13,7 @@
 //           One reflection only; skin, sclera and iris Lambertian; pupil black; the eye's front has a
 //           Beckmann glint whose width is the tear film's roughness and both lenses' radii (a disc of radius
 //           r at distance d widens the lobe of half vectors by r / (2 d)).
-// Left out  interreflection, lashes, the pupil's retro-reflection, the pupil's decentration, posterior cornea
+// Left out  interreflection, the lashes' own light, the pupil's retro-reflection, the pupil's decentration, posterior cornea
 // and lens.
 #ifndef SIM_SCENE_H
 #define SIM_SCENE_H

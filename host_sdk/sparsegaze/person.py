@@ -48,6 +48,8 @@ class Person:
     lid_thickness_mm: float = 1.6
     lid_softness_mm: float = 0.8
     lid_radius_mm: float = 13.3
+    lash_length_mm: float = 8.0
+    lash_opacity: float = 0.0
     brow_mm: float = 9.0
     nose_mm: float = 16.0
     cheek_mm: float = 3.0
