@@ -17,6 +17,7 @@ optiboot=/usr/share/arduino/hardware/arduino/avr/bootloaders/optiboot/optiboot_a
 say() { echo "setup: $*"; }
 die() { echo "setup: $*" >&2; exit 1; }
 
+has_library() { ldconfig -p 2>/dev/null | grep -q "$1" || /sbin/ldconfig -p 2>/dev/null | grep -q "$1"; }
 has_header() { echo "#include <$1>" | cc -E -x c - >/dev/null 2>&1; }
 has_ensurepip() { "$python" -c 'import ensurepip, venv' 2>/dev/null; }
 has_python_header() {
@@ -39,6 +40,7 @@ missing_packages() {
         [ -e "$optiboot" ] || echo arduino-core-avr            # virtual Nano: the stock bootloaders
     else
         command -v avrdude >/dev/null || echo avrdude          # a test flashes with it too
+        has_library libOSMesa.so || echo libosmesa6            # view --renderer osmesa
     fi
 }
 
