@@ -15,7 +15,7 @@ from cffi import FFI
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 SIM_C = os.path.normpath(os.path.join(HERE, "..", "..", "sim_c"))
-HEADERS = ("sim_map.h", "sim_eye.h", "sim_scene.h")
+HEADERS = ("sim_map.h", "sim_eye.h", "sim_scene.h", "sim_image.h")
 SOURCES = (
     "sim_map.c",
     "sim_eye.c",
@@ -25,6 +25,8 @@ SOURCES = (
     "sim_diffuse.c",
     "sim_glint.c",
     "sim_scene.c",
+    "sim_image.c",
+    "sim_image_face.c",
 )
 
 

@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's way to a response: the image that a sensor sees, times its window, summed. For comparison with
+scene.py, whose integrals are both faster and closer to the truth, and for looking at.
+
+An image errs where scene.py does not: edges and narrow glints fall between its pixels (a pixel must not be
+wider than 0.2 of the glint's lobe, about 0.2 * roughness in the tangent of the angle, at 30 mm), light
+beyond its border is missing, and a few bits hold either a glint or what is around it. The last is what the
+paper warns of; `bits` and `clip` show it.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from .errors import SceneError
+from .scene import Scene, simulator
+
+PARTS = {"face": 1, "sclera": 2, "iris": 4, "glint": 8}
+OCCLUSION = {"soft": 0, "rays": 1}
+RENDERERS = ("embree", "osmesa")
+MIDDLE_GREY = 0.18
+
+
+class ImageMethod:
+    """Images of one headset on one person, and the responses that they sum to.
+
+    pixels              of each image's side, 2..4096
+    half_width_sigmas   what an image covers: +- so many standard deviations of the sensor's window, in
+                        tangents. Beyond 3 sigma lie 0.5 % of what the window lets through, beyond 4 0.01 %.
+    renderer            "embree": float64, face by Embree's rays. "osmesa": float32, all in a fragment shader.
+    occlusion           "soft": as in sim_scene.h. "rays": what a ray meets first, and shadow rays (embree
+                        only): to see what soft horizons leave out.
+    Raises SceneError when the scene is impossible or the renderer is missing.
+    """
+
+    def __init__(
+        self,
+        headset,
+        person,
+        slip_mm=(0.0, 0.0, 0.0),
+        pixels=128,
+        half_width_sigmas=4.0,
+        renderer="embree",
+        occlusion="soft",
+    ):
+        if renderer not in RENDERERS:
+            raise SceneError("no renderer %r" % (renderer,), "one of: " + ", ".join(RENDERERS))
+        if occlusion not in OCCLUSION or (occlusion == "rays" and renderer != "embree"):
+            raise SceneError("no occlusion %r with %s" % (occlusion, renderer), "soft, or rays with embree")
+        self.headset, self.pixels, self.half_width_sigmas = headset, pixels, half_width_sigmas
+        self.renderer, self.occlusion = renderer, occlusion
+        self.scene = Scene(headset, person, slip_mm)
+        self.shape = self.scene.shape
+        self._cameras = {}
+
+    def camera(self, sensor, emitters=None):
+        """The Camera of one sensor, for the given emitters (default all); kept for the next call."""
+        count = self.shape[1]
+        chosen = tuple(range(count)) if emitters is None else tuple(int(e) for e in emitters)
+        for what, number, limit in [("sensor", sensor, self.shape[0])] + [
+            ("emitter", e, count) for e in chosen
+        ]:
+            if not 0 <= number < limit:
+                raise SceneError(
+                    "%s has no %s %d" % (self.headset.name, what, number), "0 to %d" % (limit - 1)
+                )
+        if not chosen:
+            raise SceneError("no emitter is lit", "name at least one")
+        key = (int(sensor), chosen)
+        if key not in self._cameras:
+            made = _EmbreeCamera if self.renderer == "embree" else _osmesa_camera
+            self._cameras[key] = made(self, *key)
+        return self._cameras[key]
+
+    def response(
+        self,
+        azimuth_deg,
+        elevation_deg,
+        pupil_mm=3.5,
+        lid_opening=1.0,
+        bits="float",
+        clip=False,
+        cos3=True,
+        parts=PARTS,
+    ):
+        """[sensor, emitter] at one state, in the unit of Scene.response().
+
+        bits    "float", 16 or 8: of the pixels, one exposure for each image (expose())
+        cos3    False: the paper's plain sum, in which all pixels weigh the same, not their solid angle
+        parts   names of the parts (PARTS) that are there to be seen
+        """
+        out = np.empty(self.shape)
+        for sensor in range(self.shape[0]):
+            camera = self.camera(sensor)
+            weight = camera.window * (camera.solid_angle if cos3 else camera.solid_angle.max())
+            image = camera.render(azimuth_deg, elevation_deg, pupil_mm, lid_opening, parts)
+            for emitter in range(self.shape[1]):
+                seen = expose(image[emitter], bits, clip)
+                out[sensor, emitter] = (seen * weight).sum(dtype=float)
+        return out
+
+
+def expose(image, bits="float", clip=False):
+    """An image as it is left by a camera of so many bits, in its own unit again.
+
+    Full scale is the brightest pixel, so that nothing is clipped, or with clip=True 1 / 0.18 of the mean of
+    the pixels that are not black: the usual automatic exposure, which puts the mean at middle grey (18 %)
+    and lets what is more than 5.6 times as bright saturate. Levels are linear: 0 .. 2^bits - 1, rounded to
+    the nearest.
+    """
+    if bits not in ("float", 8, 16):
+        raise SceneError("bits = %r" % (bits,), "float, 16 or 8")
+    lit = image[image > 0]
+    if lit.size == 0:
+        return image
+    full = float(lit.mean(dtype=float)) / MIDDLE_GREY if clip else float(lit.max())
+    seen = np.minimum(image, full)
+    if bits == "float":
+        return seen
+    levels = 2**bits - 1
+    return np.rint(seen / full * levels) * (full / levels)
+
+
+class _EmbreeCamera:
+    """One sensor's images by sim_image.c."""
+
+    def __init__(self, method, sensor, emitters):
+        ffi, lib = simulator()
+        error = ffi.new("char[200]")
+        made = lib.sim_image_open(
+            method.scene._scene,
+            sensor,
+            list(emitters),
+            len(emitters),
+            method.pixels,
+            method.half_width_sigmas,
+            OCCLUSION[method.occlusion],
+            error,
+            200,
+        )
+        if made == ffi.NULL:
+            raise SceneError(ffi.string(error).decode(), "see sparsegaze.image.ImageMethod")
+        self._ffi, self._lib, self._scene = ffi, lib, method.scene
+        self._image = ffi.gc(made, lib.sim_image_close)
+        n = method.pixels
+        self.shape = (len(emitters), n, n)
+        self.window, self.solid_angle, self.edges = np.empty((n, n)), np.empty((n, n)), np.empty(n + 1)
+        lib.sim_image_weights(
+            self._image,
+            ffi.from_buffer("double[]", self.window),
+            ffi.from_buffer("double[]", self.solid_angle),
+            ffi.from_buffer("double[]", self.edges),
+        )
+
+    def render(self, azimuth_deg, elevation_deg, pupil_mm, lid_opening, parts=PARTS):
+        """[emitter, row, column] radiance of the sum of the named parts."""
+        out = np.empty(self.shape)
+        bad = self._lib.sim_image_render(
+            self._image,
+            azimuth_deg,
+            elevation_deg,
+            pupil_mm,
+            lid_opening,
+            sum(PARTS[name] for name in parts),
+            self._ffi.from_buffer("double[]", out),
+        )
+        if bad:
+            raise bad_state(azimuth_deg, elevation_deg, pupil_mm, lid_opening)
+        return out
+
+    def render_parts(self, azimuth_deg, elevation_deg, pupil_mm, lid_opening):
+        """{part: [emitter, row, column]}"""
+        state = azimuth_deg, elevation_deg, pupil_mm, lid_opening
+        return {name: self.render(*state, parts=(name,)) for name in PARTS}
+
+
+def bad_state(azimuth_deg, elevation_deg, pupil_mm, lid_opening):
+    """The SceneError of a state that cannot be."""
+    return SceneError(
+        "no such state: gaze %g, %g, pupil %g mm, lids %g"
+        % (azimuth_deg, elevation_deg, pupil_mm, lid_opening),
+        "gaze within 60 degrees, a pupil smaller than the iris, lids 0 (closed) to 1 (open)",
+    )
+
+
+def _osmesa_camera(method, sensor, emitters):
+    from .osmesa import OsmesaCamera
+
+    return OsmesaCamera(method, sensor, emitters)
+
+
+@dataclass(frozen=True)
+class View:
+    """What one sensor sees. Row 0 is on top, up is the head's +y; a right eye's temple is on the left.
+
+    radiance       [emitter, row, column], per unit axial intensity of each emitter, 1/mm^2
+    parts          {face, sclera, iris, glint: the same shape}; they add up to radiance
+    window         [row, column] the sensor's sensitivity, 1 on its axis
+    solid_angle    [row, column] sr
+    edges          [column + 1] tangents of the pixels' borders from the sensor's axis, ascending: to the
+                   right, and upwards for the rows from the last to the first
+    """
+
+    sensor: int
+    emitters: tuple
+    azimuth_deg: float
+    elevation_deg: float
+    pupil_mm: float
+    lid_opening: float
+    renderer: str
+    radiance: np.ndarray
+    parts: dict
+    window: np.ndarray
+    solid_angle: np.ndarray
+    edges: np.ndarray
+
+    def sums(self):
+        """{part: [emitter] its response, 1/mm^2, and total}"""
+        weight = self.window * self.solid_angle
+        found = {name: (image * weight).sum((1, 2), dtype=float) for name, image in self.parts.items()}
+        return {**found, "total": sum(found.values())}
+
+
+def view(
+    headset,
+    person,
+    sensor,
+    azimuth_deg,
+    elevation_deg,
+    pupil_mm=3.5,
+    lid_opening=1.0,
+    emitters=None,
+    pixels=512,
+    half_width_sigmas=3.0,
+    renderer="embree",
+    slip_mm=(0.0, 0.0, 0.0),
+):
+    """The View of one sensor at one state. emitters: numbers of those that are lit; default all but the one
+    at the sensor's own place (or that one, when it is the only one).
+    """
+    method = ImageMethod(headset, person, slip_mm, pixels, half_width_sigmas, renderer)
+    if emitters is None:
+        emitters = _others(headset, sensor)
+    camera = method.camera(sensor, emitters)
+    parts = camera.render_parts(azimuth_deg, elevation_deg, pupil_mm, lid_opening)
+    return View(
+        int(sensor),
+        tuple(int(e) for e in emitters),
+        float(azimuth_deg),
+        float(elevation_deg),
+        float(pupil_mm),
+        float(lid_opening),
+        renderer,
+        sum(parts.values()),
+        parts,
+        camera.window,
+        camera.solid_angle,
+        camera.edges,
+    )
+
+
+def _others(headset, sensor):
+    count = len(headset.emitters)
+    if not 0 <= sensor < len(headset.sensors):
+        return range(count)
+    here = headset.sensors[sensor].position_mm
+    return [e for e in range(count) if headset.emitters[e].position_mm != here] or range(count)
+
+
+@lru_cache(maxsize=4)
+def _method(key, headset, person, *rest):
+    return ImageMethod(headset, person, *rest)
+
+
+def image_response(
+    headset,
+    person,
+    azimuth_deg,
+    elevation_deg,
+    pupil_mm=3.5,
+    lid_opening=1.0,
+    pixels=128,
+    bits="float",
+    clip=False,
+    renderer="embree",
+    slip_mm=(0.0, 0.0, 0.0),
+    half_width_sigmas=4.0,
+):
+    """[sensor, emitter] by images: ImageMethod.response(). What does not depend on the state (the face, its
+    shadows) is kept from one call to the next with the same headset, person, slip and image.
+    """
+    slip = tuple(float(v) for v in slip_mm)
+    made = _method(headset.describe(), headset, person, slip, pixels, half_width_sigmas, renderer)
+    return made.response(azimuth_deg, elevation_deg, pupil_mm, lid_opening, bits, clip)
