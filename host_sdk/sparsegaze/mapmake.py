@@ -1,0 +1,354 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exact method of `maps.compute_map`: every term at the fineness that a pilot found sufficient, the slow
+ones interpolated between Chebyshev points where that measures well, and the hardest gazes checked afterwards.
+
+Bound     Per term, the worst error seen, at the pilot's gazes and at the hardest gazes of the finished map,
+          as a part of what its pair has at most; over all pairs together; times SAFETY; times what each pair
+          has at most. Pooling lets 36 pairs' errors at 20 gazes stand for every pair: what one pair's dozen
+          gazes missed another's have seen.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from . import mapplan
+from .mapcall import calls
+from .scene import Scene
+
+TERMS = ("face", "sclera", "iris", "glint")
+SLOW = ("sclera", "iris")
+# Part of the tolerance that each term's integration, and each interpolation, may take. They add up as
+# independent errors do: sqrt(4 * 0.35^2 + 2 * 0.3^2) = 0.82.
+SHARE, SHARE_BETWEEN = 0.35, 0.3
+SAFETY = 3.0
+PEAK = 10.0  # an error at one gaze may be this many times the tolerance
+FIRST_NODES, MOST_NODES = 9, 129
+WORTH = 0.6  # interpolation is dropped when its points are more than this part of the map's gazes
+ROUNDS = 3
+PROGRESS = {"face": 0.02, "sclera": 0.3, "iris": 0.28, "glint": 0.4}  # part of a map's work, roughly
+
+
+class Making:
+    """One map while it is made. Axes in degrees ascending, states as arrays of one length.
+
+    After make(): mean (response), errors {term: worst, as a part of its pair's peak}, rms {term: of the
+    mean}, left_out (sentences).
+    """
+
+    def __init__(self, headset, person, azimuth_deg, elevation_deg, states, tol, workers, progress):
+        self.headset, self.person, self.tol = headset, person, tol
+        self.azimuth, self.elevation = azimuth_deg, elevation_deg
+        self.pupil, self.lid, self.slip = states
+        self.pairs = (len(headset.sensors), len(headset.emitters))
+        self.errors, self.rms, self._notes = {}, {}, {}
+        self._workers, self._progress, self._base, self._shown = workers, progress, 0.0, 0.0
+        self._between_share = dict.fromkeys(SLOW, SHARE_BETWEEN)
+        self._scenes, self._rough = {}, {}
+
+    def run(self, function, items, part=0.0):
+        """List of function(item), in threads. part: of the progress that they are together."""
+        items, futures = list(items), []
+        try:
+            futures = [self._pool.submit(function, item) for item in items]
+            values = []
+            for future in futures:
+                values.append(future.result())
+                self._shown = max(self._shown, min(0.999, self._base + part * len(values) / len(items)))
+                if self._progress:
+                    self._progress(self._shown)
+            return values
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            raise
+
+    def make(self):
+        """Parts {term: [state, sensor, emitter, elevation, azimuth]}."""
+        with ThreadPoolExecutor(self._workers) as self._pool:
+            self._plan()
+            parts, wanted = {}, TERMS
+            for _ in range(ROUNDS):
+                for term in wanted:
+                    parts[term] = self._term(term)
+                wanted = self._audit(parts)
+                if not wanted:
+                    break
+                self._refine(wanted)
+        total = sum(parts.values())
+        self.mean = mean_response(np.moveaxis(total, (1, 2), (3, 4)), self.azimuth, self.elevation)
+        return {term: np.moveaxis(values, (1, 2), (3, 4)) for term, values in parts.items()}
+
+    def bound(self, parts):
+        """Bound of the error at any gaze, [state, sensor, emitter]."""
+        return sum(SAFETY * self.errors[term] * scale_of(parts[term].max((3, 4))) for term in TERMS)
+
+    def _rms(self, error):
+        """Over the pairs that count (its last two axes) and everything else."""
+        return float(np.sqrt((error[..., counted_pairs(self.pairs)] ** 2).mean()))
+
+    def _keep(self, term, error, peak):
+        """Keep the worst error [n, sensor, emitter] of a term as a part of what its pair has at most."""
+        worst = float((error / scale_of(peak)).max()) if error.size else 0.0
+        self.errors[term] = max(self.errors.get(term, 0.0), worst)
+
+    # fineness ----------------------------------------------------------------------------------------------
+
+    def _plan(self):
+        order = np.lexsort((self.pupil, self.lid))
+        picked = order[np.linspace(0, len(order) - 1, mapplan.N_PILOT).round().astype(int)]
+        picked = picked[(5 * np.arange(len(picked))) % len(picked)]  # a pose with any gaze
+        self._middle = self.slip[np.argmin(np.abs(self.slip).sum(1))]
+        gazes = mapplan.pilot_gazes(self.azimuth, self.elevation)
+        states = [(self.pupil[i], self.lid[i]) for i in picked]
+        self.pilot = mapplan.Pilot(self.headset, self.person, self._middle, gazes, states, self.run)
+        self.mean = float(
+            sum(self.pilot.value(term, 0) for term in TERMS)[:, counted_pairs(self.pairs)].mean()
+        )
+        self.rung, self.quality = {}, {}
+        for term in TERMS:
+            self._settle(term, self.pilot.choose(term, SHARE * self.tol * self.mean, self._rms))
+        self._permit_mirror()
+
+    def _settle(self, term, rung):
+        self.rung[term], self.quality[term] = rung, mapplan.fineness(term, rung)
+        error = self.pilot.error(term, rung)
+        self._keep(term, error, np.abs(self.pilot.value(term, rung)).max(0))
+        self.rms[term] = mapplan.RMS_SAFETY * self._rms(error) / max(self.mean, 1e-300)
+
+    def _permit_mirror(self):
+        """Let mirror points stand in for the lobe where sim_c's own estimate allows it, when the pilot's
+        gazes confirm that.
+        """
+        pilot, rung, share = self.pilot, self.rung["glint"], SHARE * self.tol * self.mean
+        if not 0 < share < 1:
+            return
+        quality = {"glint": self.quality["glint"], "face": 0.1, "tolerance": share}
+        value = pilot.of(Scene(self.headset, self.person, self._middle, quality), "glint")
+        error = np.abs(value - pilot.value("glint", rung + mapplan.FINER))
+        rms = mapplan.RMS_SAFETY * self._rms(error)
+        if rms > share or np.array_equal(value, pilot.value("glint", rung)):
+            return
+        self.quality["tolerance"] = share
+        self._keep("glint", error, value.max(0))
+        self.rms["glint"] = rms / self.mean
+        self._notes["mirror"] = (
+            "glint: a mirror point instead of the whole lobe of directions, where the change is estimated "
+            "below the tolerance; error %.1e of the mean (rms)" % (rms / self.mean)
+        )
+
+    def _refine(self, terms):
+        """After an audit that found terms too coarse."""
+        for term in terms:
+            if term in self._rough:
+                self._between_share[term] /= 4
+            elif term == "glint" and "tolerance" in self.quality:
+                del self.quality["tolerance"], self._notes["mirror"]
+            else:
+                self._settle(term, min(self.rung[term] + 1, mapplan.RUNGS[term][1]))
+        self._scenes.clear()
+
+    # terms -------------------------------------------------------------------------------------------------
+
+    def _scene(self, slip, finer=False):
+        key = tuple(slip), finer
+        if key not in self._scenes:
+            quality = dict(self.quality)
+            if finer:
+                for term in ("sclera", "iris", "glint"):
+                    quality[term] = mapplan.fineness(term, self.rung[term] + mapplan.FINER)
+                quality.pop("tolerance", None)
+            self._scenes[key] = Scene(self.headset, self.person, slip, quality)
+        return self._scenes[key]
+
+    def _term(self, term):
+        """[state, elevation, azimuth, sensor, emitter] of a term, at every gaze of the map."""
+        out = np.zeros((len(self.pupil), len(self.elevation), len(self.azimuth)) + self.pairs)
+        slips = np.unique(self.slip, axis=0)
+        self._rough.pop(term, None)
+        for number, slip in enumerate(slips):
+            members = np.flatnonzero((self.slip == slip).all(1))
+            if term != "face":
+                members = members[self.lid[members] > 0]  # closed lids hide the eye: exactly nothing
+            groups = calls(self.pupil, self.lid, members, term)
+            for call in groups:
+                part = PROGRESS[term] / len(slips) / len(groups)
+                out[call.members] = self._values(self._scene(slip), call, part)
+                self._base += part
+        return out
+
+    def _values(self, scene, call, part):
+        """[member, elevation, azimuth, sensor, emitter] for one call's states."""
+        if call.term == "face":  # the same wherever the eye looks sideways
+            return self._direct(scene, call, self.elevation, self.azimuth[:1], part)
+        made = self._between(scene, call, part) if call.term in SLOW else None
+        return self._direct(scene, call, self.elevation, self.azimuth, part) if made is None else made
+
+    def _direct(self, scene, call, elevation, azimuth, part=0.0):
+        """A term at every gaze of two axes, [member, elevation, azimuth, sensor, emitter]."""
+        gazes = [(a, e) for e in elevation for a in azimuth]
+        values = np.concatenate(
+            self.run(
+                lambda some: np.array([call.value(scene, a, e) for a, e in some]),
+                [gazes[i : i + 8] for i in range(0, len(gazes), 8)],
+                part,
+            )
+        )
+        shape = (len(elevation), len(azimuth)) + values.shape[1:]
+        return np.moveaxis(values.reshape(shape), 2, 0)
+
+    def _between(self, scene, call, part):
+        """The same by interpolation between Chebyshev points, halved along the rougher axis until the pilot's
+        gazes agree; None when direct evaluation costs less.
+        """
+        axes = self.elevation, self.azimuth
+        count = [1 if len(axis) == 1 else FIRST_NODES for axis in axes]
+        limit = WORTH * len(axes[0]) * len(axes[1])
+        gazes, tolerance = self.pilot.gazes, self._between_share[call.term] * self.tol * self.mean
+        truth, known = None, {}
+        while count[0] * count[1] <= limit:
+            if truth is None:
+                truth = np.array(self.run(lambda gaze: call.value(scene, *gaze), gazes))
+            nodes = [mapplan.chebyshev_nodes(axis[0], axis[-1], n) for axis, n in zip(axes, count)]
+            stride = [1 if n == 1 else (MOST_NODES - 1) // (n - 1) for n in count]
+            places = [(i, j) for i in range(count[0]) for j in range(count[1])]
+            new = [(i, j) for i, j in places if (i * stride[0], j * stride[1]) not in known]
+            values = self.run(
+                lambda at: call.value(scene, nodes[1][at[1]], nodes[0][at[0]]), new, part * len(new) / limit
+            )
+            known.update(((i * stride[0], j * stride[1]), value) for (i, j), value in zip(new, values))
+            table = np.array([known[i * stride[0], j * stride[1]] for i, j in places])
+            table = table.reshape(tuple(count) + table.shape[1:])
+            error = np.abs(mapplan.interpolate_at(table, *nodes, gazes) - truth)
+            rms = mapplan.RMS_SAFETY * self._rms(error)
+            if rms <= tolerance:
+                return self._interpolated(call, table, nodes, error, rms)
+            growable = [i for i in (0, 1) if 1 < count[i] < MOST_NODES]
+            if not growable:
+                break
+            grow = max(growable, key=lambda i: mapplan.tail(table, i))
+            count[grow] = 2 * count[grow] - 1
+        return None
+
+    def _interpolated(self, call, table, nodes, error, rms):
+        axes, term = (self.elevation, self.azimuth), call.term
+        made = np.moveaxis(mapplan.interpolate(table, *nodes, *axes), 2, 0)
+        step = [1 if len(n) == 1 else 2 for n in nodes]
+        coarse = mapplan.interpolate(
+            table[:: step[0], :: step[1]], nodes[0][:: step[0]], nodes[1][:: step[1]], *axes
+        )
+        rough = self._rough.setdefault(term, np.zeros((len(self.pupil),) + made.shape[1:3]))
+        scale = scale_of(np.abs(made).max((0, 1, 2)))
+        rough[call.members] = (np.abs(made - np.moveaxis(coarse, 2, 0)) / scale).max((3, 4))
+        self._keep(term, error.reshape((-1,) + self.pairs), np.abs(made).max((0, 1, 2)))
+        before = self.rms[term]
+        self.rms[term] = float(np.hypot(before, rms / self.mean)) if term not in self._notes else before
+        self._notes[term] = (
+            "%s: computed at %d x %d gazes (azimuth x elevation) and interpolated; error at gazes between "
+            "them %.1e of the mean (rms)" % (term, len(nodes[1]), len(nodes[0]), rms / self.mean)
+        )
+        return made
+
+    # the hardest gazes -------------------------------------------------------------------------------------
+
+    def _audit(self, parts):
+        """Compare the map with everything twice as fine where it is likeliest to be wrong; returns the terms
+        whose error at a gaze is more than PEAK tolerances.
+        """
+        chosen = set()
+        for term in ("sclera", "iris", "glint"):
+            rough = self._rough.get(term)
+            if rough is None:
+                peak = scale_of(parts[term].max((0, 1, 2)))
+                rough = (bend(parts[term]) / peak).max((3, 4))
+            chosen.update(hardest(rough, self.azimuth, self.elevation, 3 + min(12, len(self.pupil) // 2)))
+        chosen = sorted(chosen)
+
+        def finer(place):
+            state, row, column = place
+            scene = self._scene(self.slip[state], finer=True)
+            gaze = self.azimuth[column], self.elevation[row]
+            return [
+                mapplan.term_value(scene, term, *gaze, self.pupil[state], self.lid[state])
+                for term in TERMS[1:]
+            ]
+
+        for slip in {tuple(self.slip[place[0]]) for place in chosen}:
+            self._scene(slip, finer=True)
+        values = np.array(self.run(finer, chosen)).reshape((len(chosen), len(TERMS) - 1) + self.pairs)
+        bad = []
+        for k, term in enumerate(TERMS[1:]):
+            error = np.array([np.abs(v - parts[term][at]) for v, at in zip(values[:, k], chosen)])
+            error = error.reshape((-1,) + self.pairs)
+            if error.size and error.max() > PEAK * self.tol * self.mean:
+                bad.append(term)
+            self._keep(term, error, parts[term].max((0, 1, 2)))
+        return bad
+
+    def left_out(self):
+        """Sentences on what was left out or simplified, why, and what that costs."""
+        said = []
+        if (self.lid == 0).any():
+            said.append("lids closed (opening 0): sclera, iris and glint are hidden exactly; error 0")
+        if len(self.azimuth) > 1:
+            said.append("face: computed once per elevation, because the lids follow elevation only; error 0")
+        for term in ("sclera", "iris", "mirror"):
+            if term in self._notes:
+                said.append(self._notes[term])
+        for term in TERMS:
+            said.append(
+                "%s: integrated at fineness %.2g; against twice that, %.1e of the mean (rms)"
+                % (term, self.quality[term], self.rms[term])
+            )
+        return said
+
+
+def counted_pairs(pairs):
+    """Mask [sensor, emitter] of the pairs of two different places, or of all when there are no other."""
+    if pairs[0] != pairs[1] or pairs[0] == 1:
+        return np.ones(pairs, bool)
+    return ~np.eye(pairs[0], dtype=bool)
+
+
+def mean_response(response, azimuth_deg, elevation_deg):
+    """The unit of errors: mean over gazes within +-20 degrees (all, when there are none) and over the pairs
+    that count. response [..., sensor, emitter, elevation, azimuth].
+    """
+    up, across = np.abs(elevation_deg) <= 20 + 1e-9, np.abs(azimuth_deg) <= 20 + 1e-9
+    if up.any() and across.any():
+        response = response[..., up, :][..., across]
+    return float(np.moveaxis(response, (-4, -3), (0, 1))[counted_pairs(response.shape[-4:-2])].mean())
+
+
+def scale_of(peak):
+    """What a pair's error is measured by: its peak, and a fiftieth of the average pair's so that pairs which
+    see next to nothing do not count as hard. peak [..., sensor, emitter].
+    """
+    return peak + 0.02 * peak.mean((-2, -1), keepdims=True) + 1e-300
+
+
+def bend(table):
+    """How sharply a table [state, elevation, azimuth, ...] bends from gaze to gaze; its value on an axis too
+    short for that.
+    """
+    out = np.zeros_like(table)
+    for axis in (1, 2):
+        if table.shape[axis] > 2:
+            inner = tuple(slice(1, -1) if k == axis else slice(None) for k in range(table.ndim))
+            out[inner] += np.abs(np.diff(table, 2, axis))
+    return out if out.any() else table
+
+
+def hardest(rough, azimuth, elevation, count, apart_deg=3.0):
+    """The `count` highest places (state, row, column) of [state, elevation, azimuth], some way apart."""
+    rough, places = rough.copy(), []
+    for _ in range(count):
+        at = tuple(int(i) for i in np.unravel_index(np.argmax(rough), rough.shape))
+        if not rough[at] > 0:
+            break
+        places.append(at)
+        near = (np.abs(elevation - elevation[at[1]]) < apart_deg)[:, None] & (
+            np.abs(azimuth - azimuth[at[2]]) < apart_deg
+        )
+        rough[at[0]][near] = 0
+    return places
