@@ -13,8 +13,8 @@ from sparsegaze.person import draw_person, nominal_person
 from sparsegaze.scene import Scene
 
 # A pinhole has no lens: all lenses are points here, so that both ways mean the same.
-SENSOR = port((15.99, 0.56, -28.0), (-1.5, 1.5, -11.0), 8.5, 0.0)
-EMITTER = port((-10.28, -12.26, -28.0), (-5.5, -3.5, -11.0), 10.0, 0.0)
+SENSOR = port((3.87, -15.52, -28.0), (7.5, 1.5, -11.0), 8.5, 0.0)
+EMITTER = port((14.62, -6.51, -28.0), (1.5, -6.5, -11.0), 8.5, 0.0)
 HEADSET = pair(SENSOR, EMITTER)
 PERSON = replace(nominal_person(), roughness=0.05)
 GAZES = [(0, 0), (10, -5), (-12, 8), (20, -15), (5, 17)]
@@ -40,7 +40,7 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@pytest.mark.parametrize("part, bar", [("sclera", 5e-4), ("iris", 5e-4), ("glint", 1e-5)])
+@pytest.mark.parametrize("part, bar", [("face", 1e-5), ("sclera", 1e-6), ("iris", 2e-4), ("glint", 1e-6)])
 def test_more_pixels_come_closer_to_the_integral(part, bar):
     coarse, fine = rms(errors(part, 48)), rms(errors(part, 384))
-    assert fine < bar and fine < coarse / 4
+    assert fine < bar and fine < coarse / 10
