@@ -198,13 +198,14 @@ class Making:
         return np.moveaxis(values.reshape(shape), 2, 0)
 
     def _between(self, scene, call, part):
-        """The same by interpolation between Chebyshev points, halved along the rougher axis until the pilot's
-        gazes agree; None when direct evaluation costs less.
+        """The same by interpolation between Chebyshev points, halved along the rougher axis until gazes
+        between them agree; None when direct evaluation costs less.
         """
         axes = self.elevation, self.azimuth
         count = [1 if len(axis) == 1 else FIRST_NODES for axis in axes]
         limit = WORTH * len(axes[0]) * len(axes[1])
-        gazes, tolerance = self.pilot.gazes, self._between_share[call.term] * self.tol * self.mean
+        gazes = mapplan.inner_gazes(self.azimuth, self.elevation)
+        tolerance = self._between_share[call.term] * self.tol * self.mean
         truth, known = None, {}
         while count[0] * count[1] <= limit:
             if truth is None:

@@ -25,10 +25,17 @@ def pilot_gazes(azimuth_deg, elevation_deg, count=N_PILOT):
     """
     low = np.array([azimuth_deg.min(), elevation_deg.min()])
     span = np.array([azimuth_deg.max(), elevation_deg.max()]) - low
-    fixed = [(0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0), (0.5, 1)]
+    fixed = np.array([(0, 0), (1, 0), (0, 1), (1, 1), (0.5, 0), (0.5, 1)])
+    return np.vstack([low + span * fixed, inner_gazes(azimuth_deg, elevation_deg, count)])[:count]
+
+
+def inner_gazes(azimuth_deg, elevation_deg, count=N_PILOT):
+    """Quasi-random gazes [count, 2] inside the rectangle of two axes: none is a node of anything."""
+    low = np.array([azimuth_deg.min(), elevation_deg.min()])
+    span = np.array([azimuth_deg.max(), elevation_deg.max()]) - low
     golden = 1.324717957244746
-    steps = np.arange(1, max(0, count - len(fixed)) + 1)[:, None] * [1 / golden, 1 / golden**2]
-    return low + span * np.vstack([fixed, (0.5 + steps) % 1])[:count]
+    steps = np.arange(1, count + 1)[:, None] * [1 / golden, 1 / golden**2]
+    return low + span * ((0.5 + steps) % 1)
 
 
 class Pilot:
@@ -109,7 +116,11 @@ def term_value(scene, term, azimuth, elevation, pupil_mm, lid_opening):
 
 
 def chebyshev_nodes(low, high, count):
-    """Chebyshev points with both ends, ascending; those of count 2n - 1 contain those of n."""
+    """Chebyshev points with both ends, ascending; those of count 2n - 1 contain those of n.
+    One: the middle.
+    """
+    if count == 1:
+        return np.array([(low + high) / 2])
     unit = -np.cos(np.pi * np.arange(count) / (count - 1))
     unit[count // 2] = 0.0
     return (low + high) / 2 + (high - low) / 2 * unit

@@ -306,3 +306,29 @@ def ring_of_sensors(made, state=0):
             }
         )
     return rings
+
+
+def rise_of_glint(angle_deg, glint, rest):
+    """The highest place of a glint along a line of gaze: {peak_deg, percent (of the rest there),
+    peak_over_median, fwhm_deg (above the median; None when the line ends first)}; None when it has no light.
+    """
+    glint, rest = np.asarray(glint, float), np.asarray(rest, float)
+    if not glint.max() > 0:
+        return None
+    at, median = int(np.argmax(glint)), float(np.median(glint))
+    half, edges = (glint[at] + median) / 2, []
+    for step in (-1, 1):
+        i = at
+        while 0 <= i + step < len(glint) and glint[i + step] > half:
+            i += step
+        j = i + step
+        if not 0 <= j < len(glint):
+            break
+        part = (glint[i] - half) / (glint[i] - glint[j])
+        edges.append(angle_deg[i] + part * (angle_deg[j] - angle_deg[i]))
+    return {
+        "peak_deg": float(angle_deg[at]),
+        "percent": float(100 * glint[at] / rest[at]) if rest[at] > 0 else float("inf"),
+        "peak_over_median": float(glint[at] / median) if median > 0 else float("inf"),
+        "fwhm_deg": float(abs(edges[1] - edges[0])) if len(edges) == 2 else None,
+    }
