@@ -113,11 +113,11 @@ def map_command(
     emitter, elevation, azimuth) and everything that it was made from; numpy.load reads it.
 
     \b
-    Examples:
+    Example:
         sparsegaze map headsets/led2gaze.toml -o map.npz --png map.png
-        sparsegaze map headsets/led2gaze.toml --person persons/deep-set.toml --lids 1 --lids 0.5 -o map.npz
-        sparsegaze map headsets/led2gaze.toml --sweep azimuth --elevation 0 -o sweep.npz --png sweep.png
-        sparsegaze map headsets/led2gaze.toml --method image --pixels 64 --bits 8 --clip -o image.npz
+        sparsegaze map headsets/led2gaze.toml --person persons/deep-set.toml --lids 0.5 -o map.npz
+        sparsegaze map headsets/led2gaze.toml --sweep azimuth --elevation 0 -o row.npz --png row.png
+        sparsegaze map headsets/led2gaze.toml --method image --pixels 64 --bits 8 -o image.npz
     """
     from . import maps
 
@@ -125,9 +125,9 @@ def map_command(
     for path in filter(None, (output, png)):
         _writable(path)
     if png:
-        from .mapfigure import require_matplotlib
+        from .mapfigure import picture_kind
 
-        require_matplotlib()
+        picture_kind(png)
     console = Console(as_json)
     common = dict(
         half_angle_deg=half_angle,

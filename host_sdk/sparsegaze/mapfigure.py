@@ -18,26 +18,29 @@ INK, FAINT, MARK = "#22303c", "#8a949e", "#d1495b"
 _DPI = 120
 
 
-def require_matplotlib():
-    """SceneError with the remedy when matplotlib is not installed."""
+def picture_kind(path):
+    """The format that a picture's name asks for. SceneError with the remedy when there is none such, or when
+    matplotlib is not installed.
+    """
     try:
         import matplotlib.figure  # noqa: F401
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
     except ImportError as error:
         raise SceneError("pictures need matplotlib (%s)" % error, "pip install 'sparsegaze[pictures]'")
+    kind = os.path.splitext(os.fspath(path))[1].lstrip(".").lower()
+    if kind not in FigureCanvasAgg.get_supported_filetypes():
+        raise SceneError("%s: no picture is called .%s" % (path, kind), "end the name in .png, .pdf or .svg")
+    return kind
 
 
 def save_figure(made, path, state=0):
     """Write the picture of one state of a GazeMap: maps, or curves when it is a sweep. The format is the
     file name's (.png, .pdf, .svg). The file appears when it is complete.
     """
-    require_matplotlib()
+    path, kind = os.fspath(path), picture_kind(path)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    path = os.fspath(path)
-    kind = os.path.splitext(path)[1].lstrip(".").lower() or "png"
-    if kind not in FigureCanvasAgg.get_supported_filetypes():
-        raise SceneError("%s: no picture is called .%s" % (path, kind), "end the name in .png, .pdf or .svg")
     rows, columns = made.response.shape[3:]
     sweep = 1 in (rows, columns) and rows * columns > 1
     sensors = made.response.shape[1]

@@ -13,8 +13,8 @@ from .scene import Scene
 
 STEP = 2.0**0.5  # fineness from rung to rung
 FINER = 2  # rungs between a value and what it is compared with
-START = {"sclera": 0.7, "iris": 0.35, "glint": 0.5, "face": 1.0}  # fineness of rung 0
-RUNGS = {"sclera": (-4, 5), "iris": (-2, 6), "glint": (-2, 7), "face": (-2, 1)}
+START = {"sclera": 0.7, "iris": 0.35, "glint": 0.5, "face": 0.5}  # fineness of rung 0
+RUNGS = {"sclera": (-4, 5), "iris": (-2, 6), "glint": (-2, 7), "face": (-2, 3)}
 RMS_SAFETY = 1.5  # a dozen gazes see this much less than the map's rms, at worst
 N_PILOT = 12
 
