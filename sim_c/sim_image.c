@@ -64,25 +64,13 @@ int sim_camera_set(struct sim_camera *camera, const struct sim_scene *scene, int
     return 0;
 }
 
-static double pixel_ray(const struct sim_camera *camera, int pixel, double ray[3]) {
+static void pixel_ray(const struct sim_camera *camera, int pixel, double ray[3]) {
     int row = pixel / camera->pixels, column = pixel % camera->pixels;
     double x = (column + 0.5) * camera->pitch - camera->half,
            y = camera->half - (row + 0.5) * camera->pitch;
     double cosine = 1 / sqrt(1 + x * x + y * y);
     for (int k = 0; k < 3; ++k)
         ray[k] = cosine * (camera->aim[k] + x * camera->right[k] + y * camera->up[k]);
-    return cosine;
-}
-
-void sim_image_weights(const struct sim_image *image, double *window, double *solid_angle, double *edges) {
-    const struct sim_camera *camera = &image->camera;
-    int n = camera->pixels;
-    for (int i = 0; i < n * n; ++i) {
-        double ray[3], c = pixel_ray(camera, i, ray);
-        window[i] = exp(-(1 / (c * c) - 1) * camera->per_tan2);
-        solid_angle[i] = camera->pitch * camera->pitch * c * c * c;
-    }
-    for (int i = 0; i <= n; ++i) edges[i] = i * camera->pitch - camera->half;
 }
 
 static int open_faces(struct sim_image *image, char *error, size_t bytes) {
@@ -257,17 +245,16 @@ static int enter_eye(const struct sim_eye *eye, const double from[3], const doub
         was_inside = gap <= 0;
     }
     if (at >= end) return 0;
-    for (int i = 0; i < 60 && at - before > 1e-13 * at; ++i) {  // regula falsi (Illinois)
-        double next = before + (at - before) * last / (last - gap), g;
-        g = outside(eye, from, ray, next, point, NULL);
+    for (int i = 0; i < 60; ++i) {  // regula falsi (Illinois)
+        *t = before + (at - before) * last / (last - gap);
+        double g = outside(eye, from, ray, *t, point, NULL);
+        if (fabs(g) < 1e-13 || at - before < 1e-13 * at) break;
         if (g <= 0) {
-            at = next, gap = g, last /= 2;
+            at = *t, gap = g, last /= 2;
         } else {
-            before = next, last = g, gap /= 2;
+            before = *t, last = g, gap /= 2;
         }
-        if (fabs(g) < 1e-13) break;
     }
-    *t = (gap <= 0 ? at : before);
     outside(eye, from, ray, *t, point, normal);
     return 1;
 }

@@ -42,9 +42,6 @@ struct sim_image *sim_image_open(const struct sim_scene *scene, int sensor, cons
                                  char *error, size_t error_bytes);
 void sim_image_close(struct sim_image *image);  // NULL allowed
 
-// window, solid_angle [pixels][pixels]; edges [pixels + 1]: tangents of the pixels' borders, from left.
-void sim_image_weights(const struct sim_image *image, double *window, double *solid_angle, double *edges);
-
 // radiance [n_emitters][pixels][pixels] receives the sum of the chosen terms. Reentrant.
 // Returns 0, or -1 for a state outside sim_scene_smooth()'s.
 int sim_image_render(const struct sim_image *image, double azimuth_deg, double elevation_deg,

@@ -114,6 +114,29 @@ static void slopes(const struct sim_image_face *face, double x, double y, double
     *wy = (height_of(p, face->relief_only, x, y + e) - height_of(p, face->relief_only, x, y - e)) / (2 * e);
 }
 
+static double gap_at(const struct sim_image_face *face, const double from[3], const double direction[3],
+                     double t) {
+    return -(from[2] + t * direction[2]) - height_of(&face->person, face->relief_only,
+                                                     from[0] + t * direction[0], from[1] + t * direction[1]);
+}
+
+// From a triangle, at *t, onto the height field that it stands for. Returns 0 when the ray passes over it.
+static int settle(const struct sim_image_face *face, const double from[3], const double direction[3],
+                  double *t) {
+    double a = *t, ga = gap_at(face, from, direction, a), b = a, gb = ga, step = 0.01;
+    while (ga <= 0 && step < 1) b = a, gb = ga, a -= step, ga = gap_at(face, from, direction, a), step *= 1.5;
+    while (gb > 0 && step < 1) a = b, ga = gb, b += step, gb = gap_at(face, from, direction, b), step *= 1.5;
+    if (ga <= 0 || gb > 0) return 0;
+    for (int i = 0; i < 60; ++i) {  // regula falsi (Illinois)
+        *t = a + (b - a) * ga / (ga - gb);
+        double g = gap_at(face, from, direction, *t);
+        if (fabs(g) < 1e-12) break;
+        if (g <= 0) b = *t, gb = g, ga /= 2;
+        else a = *t, ga = g, gb /= 2;
+    }
+    return 1;
+}
+
 int sim_image_face_hit(const struct sim_image_face *face, const double from[3], const double direction[3],
                        double t_from, struct sim_image_hit *hit) {
     struct RTCIntersectContext context;
@@ -133,25 +156,19 @@ int sim_image_face_hit(const struct sim_image_face *face, const double from[3], 
         query.hit.geomID = RTC_INVALID_GEOMETRY_ID;
         rtcIntersect1(face->scene, &context, &query);
         if (query.hit.geomID == RTC_INVALID_GEOMETRY_ID) return 0;
-        // From the triangle onto the height field: Newton along the ray.
-        double t = query.ray.tfar, wx = 0, wy = 0, enter = 0;
-        for (int i = 0; i < 6; ++i) {
-            double x = from[0] + t * direction[0], y = from[1] + t * direction[1];
-            slopes(face, x, y, &wx, &wy);
-            enter = direction[2] + wx * direction[0] + wy * direction[1];
-            double gap = -(from[2] + t * direction[2]) - height_of(&face->person, face->relief_only, x, y);
-            if (fabs(gap) > 0.2 * fabs(enter)) break;  // grazing: the triangle is as good as it gets
-            t += gap / enter;
-            if (fabs(gap) < 1e-10) break;
-        }
-        t_from = query.ray.tfar + 1e-3;
-        if (enter <= 0 || fabs(t - query.ray.tfar) > 0.3) continue;  // out of the face, or another place
-        double length = sqrt(1 + wx * wx + wy * wy);
-        hit->beyond = t_from > t ? t_from : t + 1e-3;
+        double t = query.ray.tfar, wx, wy, *n = hit->normal;
+        t_from = t + 1e-3;
+        // The ray leaves the face where it meets a triangle from below.
+        double out = query.hit.Ng_x * direction[0] + query.hit.Ng_y * direction[1] + query.hit.Ng_z * direction[2];
+        if (out * query.hit.Ng_z <= 0 || !settle(face, from, direction, &t)) continue;
         for (int k = 0; k < 3; ++k) hit->point[k] = from[k] + t * direction[k];
-        hit->normal[0] = -wx / length;
-        hit->normal[1] = -wy / length;
-        hit->normal[2] = -1 / length;
+        slopes(face, hit->point[0], hit->point[1], &wx, &wy);
+        double length = sqrt(1 + wx * wx + wy * wy);
+        n[0] = -wx / length;
+        n[1] = -wy / length;
+        n[2] = -1 / length;
+        if (sim_dot(n, direction) >= 0) continue;
+        hit->beyond = t_from > t ? t_from : t + 1e-3;
         return 1;
     }
 }

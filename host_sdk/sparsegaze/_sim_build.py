@@ -15,7 +15,7 @@ from cffi import FFI
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 SIM_C = os.path.normpath(os.path.join(HERE, "..", "..", "sim_c"))
-HEADERS = ("sim_map.h", "sim_eye.h", "sim_scene.h", "sim_image.h")
+HEADERS = ("sim_map.h", "sim_eye.h", "sim_scene.h", "sim_image.h", "sim_osmesa.h")
 SOURCES = (
     "sim_map.c",
     "sim_eye.c",
@@ -27,6 +27,7 @@ SOURCES = (
     "sim_scene.c",
     "sim_image.c",
     "sim_image_face.c",
+    "sim_osmesa.c",
 )
 
 
@@ -45,10 +46,18 @@ def source_hash():
     """SHA-256 of every source: maps made by another version of the simulator are not found in the cache."""
     digest = hashlib.sha256()
     for name in sorted(os.listdir(SIM_C)):
-        if name.endswith((".c", ".h")) and not name.startswith("sim_map"):
+        if name.endswith((".c", ".h", ".glsl")) and not name.startswith("sim_map"):
             with open(os.path.join(SIM_C, name), "rb") as file:
                 digest.update(name.encode() + b"\0" + file.read())
     return digest.hexdigest()
+
+
+def shader_text():
+    """sim_osmesa.glsl as a C string. Its comment comes first, #version must: the comment stays behind."""
+    with open(os.path.join(SIM_C, "sim_osmesa.glsl"), encoding="utf-8") as file:
+        text = file.read()
+    lines = text[text.index("#version") :].splitlines()
+    return "\n".join('    "%s\\n"' % line.replace("\\", "\\\\").replace('"', '\\"') for line in lines)
 
 
 def builder():
@@ -58,10 +67,11 @@ def builder():
     ffi.set_source(
         "sparsegaze._sim",
         "\n".join('#include "%s"' % name for name in HEADERS)
-        + '\nconst char sim_source_hash[] = "%s";\n' % source_hash(),
+        + '\nconst char sim_source_hash[] = "%s";\n' % source_hash()
+        + "const char sim_osmesa_shader[] =\n%s;\n" % shader_text(),
         sources=[os.path.join(SIM_C, name) for name in SOURCES],
         include_dirs=[SIM_C],
-        libraries=["embree3", "m"],
+        libraries=["embree3", "dl", "m"],
         extra_compile_args=["-std=c11", "-O3", "-fno-math-errno", "-Wall", "-Wextra"],
     )
     return ffi

@@ -122,6 +122,18 @@ def expose(image, bits="float", clip=False):
     return np.rint(seen / full * levels) * (full / levels)
 
 
+def camera_weights(sigma_deg, pixels, half_width_sigmas):
+    """Window [row, column], solid angle [row, column] in sr and the pixels' borders [column + 1] in tangents,
+    of a sensor's image.
+    """
+    sigma = np.tan(np.radians(sigma_deg))
+    edges = np.linspace(-1, 1, pixels + 1) * half_width_sigmas * sigma
+    middle = (edges[1:] + edges[:-1]) / 2
+    tan2 = middle**2 + middle[:, None] ** 2
+    pitch = 2 * half_width_sigmas * sigma / pixels
+    return np.exp(-tan2 / (2 * sigma**2)), pitch**2 * (1 + tan2) ** -1.5, edges
+
+
 class _EmbreeCamera:
     """One sensor's images by sim_image.c."""
 
@@ -143,19 +155,14 @@ class _EmbreeCamera:
             raise SceneError(ffi.string(error).decode(), "see sparsegaze.image.ImageMethod")
         self._ffi, self._lib, self._scene = ffi, lib, method.scene
         self._image = ffi.gc(made, lib.sim_image_close)
-        n = method.pixels
-        self.shape = (len(emitters), n, n)
-        self.window, self.solid_angle, self.edges = np.empty((n, n)), np.empty((n, n)), np.empty(n + 1)
-        lib.sim_image_weights(
-            self._image,
-            ffi.from_buffer("double[]", self.window),
-            ffi.from_buffer("double[]", self.solid_angle),
-            ffi.from_buffer("double[]", self.edges),
+        self._shape = (len(emitters), method.pixels, method.pixels)
+        self.window, self.solid_angle, self.edges = camera_weights(
+            method.headset.sensors[sensor].sigma_deg, method.pixels, method.half_width_sigmas
         )
 
     def render(self, azimuth_deg, elevation_deg, pupil_mm, lid_opening, parts=PARTS):
         """[emitter, row, column] radiance of the sum of the named parts."""
-        out = np.empty(self.shape)
+        out = np.empty(self._shape)
         bad = self._lib.sim_image_render(
             self._image,
             azimuth_deg,
