@@ -10,6 +10,9 @@
 #include "sim_face.h"
 
 static const double X_FROM = -34, X_TO = 30, Y_FROM = -32, Y_TO = 32, MESH_STEP = 0.25;
+// Between its corners a triangle lies behind the face by up to 1.2e-3 mm, and a ray that grazes the face would
+// pass: so the mesh stands this far before it. settle() knows better.
+static const double MESH_FORWARD = 2e-3;
 // The height field in a table, for horizons: between its nodes a parabola's error is 1e-3 mm at most.
 enum { TABLE_NODES = 1281 };
 static const double TABLE_FROM = -64, TABLE_STEP = 0.1;
@@ -60,7 +63,7 @@ static RTCScene mesh_of(RTCDevice device, const struct sim_person *person, int r
             float *v = vertex + 3 * (j * nx + i);
             v[0] = (float)x;
             v[1] = (float)y;
-            v[2] = (float)-height_of(person, relief_only, x, y);
+            v[2] = (float)-(height_of(person, relief_only, x, y) + MESH_FORWARD);
         }
     for (int j = 0; j + 1 < ny; ++j)
         for (int i = 0; i + 1 < nx; ++i) {
