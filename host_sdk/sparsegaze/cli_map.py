@@ -194,6 +194,8 @@ def _writable(path):
 
 def _report(made, output, png):
     """The command's result as data."""
+    from .ring import ring_of_sensors
+
     states, n, m, rows, columns = made.response.shape
     known = made.method == "exact"
     return {
@@ -205,19 +207,13 @@ def _report(made, output, png):
         "emitters": m,
         "gazes": rows * columns,
         "mean": made.mean,
-        "rings": _rings(made),
+        "rings": ring_of_sensors(made),
         "estimate_rms": made.estimate_rms,
         "error_bound": float(made.error_estimate.max() / made.mean) if known and made.mean else None,
         "left_out": made.left_out,
         "seconds": made.seconds,
         "responses_per_second": made.response.size / made.seconds,
     }
-
-
-def _rings(made):
-    from .maps import ring_of_sensors
-
-    return ring_of_sensors(made)
 
 
 def _words(made, output, png):

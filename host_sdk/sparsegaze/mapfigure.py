@@ -11,7 +11,8 @@ import tempfile
 import numpy as np
 
 from .errors import SceneError
-from .maps import TERMS, rise_of_glint
+from .mapmake import TERMS
+from .ring import rise_of_glint
 
 COLOURS = {"face": "#c9b29b", "sclera": "#8fb8de", "iris": "#5b8c5a", "glint": "#e8a33d"}
 INK, FAINT, MARK = "#22303c", "#8a949e", "#d1495b"
@@ -242,7 +243,7 @@ def _name_spike(view, angle, glint, rise):
     view.text(
         angle[at],
         1.12 * glint[at],
-        "+%.0f %% of the rest at %.1f deg%s" % (rise["percent"], rise["peak_deg"], wide),
+        "%+.0f %% of the rest at %.1f deg%s" % (rise["percent"] or np.inf, rise["peak_deg"], wide),
         fontsize=7.5,
         color=MARK,
         ha="left" if far < 0.25 else "right" if far > 0.75 else "center",

@@ -22,6 +22,7 @@ from . import __version__
 from .errors import SceneError
 from .mapmake import TERMS, Making, mean_response
 from .mapstore import read_map, write_npz
+from .ring import ring_figures  # noqa: F401  (part of this module's interface)
 from .simulate import as_headset, as_person
 
 HALF_ANGLE_DEG, GRID, TOL = 25.0, 41, 1e-4
@@ -281,54 +282,3 @@ def _states(pupil_mm, lid_opening, slip_mm, person):
         np.ascontiguousarray(np.broadcast_to(lid, count)),
         np.ascontiguousarray(np.broadcast_to(slip, (count, 3))),
     )
-
-
-# the bright ring --------------------------------------------------------------------------------------------
-
-
-def ring_of_sensors(made, state=0):
-    """Where each sensor's glint is brightest against everything else, other emitters lit: a list of
-    {sensor, azimuth_deg, elevation_deg, glint_percent}. Empty when the parts were not kept.
-    """
-    if not made.parts:
-        return []
-    rings, glints, totals = [], made.sensor_maps(state, "glint"), made.sensor_maps(state)
-    for sensor, (glint, total) in enumerate(zip(glints, totals)):
-        rest = total - glint
-        share = np.divide(glint, rest, out=np.zeros_like(glint), where=rest > 0)
-        row, column = np.unravel_index(np.argmax(share), share.shape)
-        rings.append(
-            {
-                "sensor": sensor,
-                "azimuth_deg": float(made.azimuth_deg[column]),
-                "elevation_deg": float(made.elevation_deg[row]),
-                "glint_percent": 100 * float(share[row, column]),
-            }
-        )
-    return rings
-
-
-def rise_of_glint(angle_deg, glint, rest):
-    """The highest place of a glint along a line of gaze: {peak_deg, percent (of the rest there),
-    peak_over_median, fwhm_deg (above the median; None when the line ends first)}; None when it has no light.
-    """
-    glint, rest = np.asarray(glint, float), np.asarray(rest, float)
-    if not glint.max() > 0:
-        return None
-    at, median = int(np.argmax(glint)), float(np.median(glint))
-    half, edges = (glint[at] + median) / 2, []
-    for step in (-1, 1):
-        i = at
-        while 0 <= i + step < len(glint) and glint[i + step] > half:
-            i += step
-        j = i + step
-        if not 0 <= j < len(glint):
-            break
-        part = (glint[i] - half) / (glint[i] - glint[j])
-        edges.append(angle_deg[i] + part * (angle_deg[j] - angle_deg[i]))
-    return {
-        "peak_deg": float(angle_deg[at]),
-        "percent": float(100 * glint[at] / rest[at]) if rest[at] > 0 else float("inf"),
-        "peak_over_median": float(glint[at] / median) if median > 0 else float("inf"),
-        "fwhm_deg": float(abs(edges[1] - edges[0])) if len(edges) == 2 else None,
-    }
