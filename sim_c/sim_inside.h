@@ -22,6 +22,18 @@ struct sim_window {
 
 enum { SIM_MAX_RULE = 24 };
 
+// A spot of the skin that an open eye may take the place of, as the lids see it.
+struct sim_lid_spot {
+    double alpha, beta, rho;
+};
+
+// What the quadrature of the skin met, for reports.
+struct sim_skin_facts {
+    int spots, lid_spots, lid_spots_left_out;  // evaluated; kept for lid poses; without light worth keeping
+    double lid_step_mm;                        // spacing of the latter
+    unsigned char penumbra[2 * SIM_MAX_PORTS];  // whether a site's lens is partly hidden from any lit spot
+};
+
 struct sim_scene {
     struct sim_person person;
     struct sim_quality quality;
@@ -36,7 +48,9 @@ struct sim_scene {
     const double *rule[SIM_MAX_RULE + 1];  // rule[n]: Gauss-Legendre's n abscissas on -1..1, n weights
     double *face_all;    // [sensors][emitters] response of all skin with the lids closed
     double *face_spots;  // [n_lid_spots][sensors + emitters], of what an open eye may replace
-    int *lid_spots, n_lid_spots;
+    struct sim_lid_spot *lid_spots;
+    int n_lid_spots;
+    struct sim_skin_facts skin_facts;
 };
 
 // A window's weight for light arriving along the unit vector `away` (from the scene to the site).
@@ -59,7 +73,8 @@ double sim_surface_transfer(const struct sim_site *site, const double point[3], 
 // out[sensors][emitters] += the skin's term at one lid pose.
 void sim_add_face(const struct sim_scene *scene, double elevation_deg, double opening, double *out);
 
-// Factors of every spot of the face, from its visibility. Returns 0, or -1 for lack of memory.
+// Integrates the skin with closed lids, and keeps the spots that lids may cut. Returns 0, or -1 for lack of
+// memory.
 int sim_prepare_face(struct sim_scene *scene);
 
 #endif

@@ -147,10 +147,10 @@ static int prepare(struct sim_scene *scene, char *error, size_t bytes) {
         memcpy(sites[k], scene->sites[k].position, sizeof sites[k]);
         radius[k] = scene->sites[k].radius;
     }
-    if (sim_face_open(&scene->face, &scene->person, (const double (*)[3])sites, radius, scene->n_sites,
-                      0.2 / q->face, error, bytes))
-        return -1;
-    return sim_prepare_face(scene) ? refuse(error, bytes, "out of memory") : 0;
+    if (sim_face_open(&scene->face, &scene->person, (const double (*)[3])sites, radius, scene->n_sites) ||
+        sim_prepare_face(scene))
+        return refuse(error, bytes, "out of memory");
+    return 0;
 }
 
 struct sim_scene *sim_scene_open(const struct sim_person *person, const struct sim_port *sensors,
@@ -194,6 +194,28 @@ void sim_scene_close(struct sim_scene *scene) {
 
 double sim_person_face_mm(const struct sim_person *person, double x_mm, double y_mm) {
     return sim_face_height(person, x_mm, y_mm);
+}
+
+double sim_person_horizon_mm(const struct sim_person *person, const double from_mm[3], const double to_mm[3],
+                             int relief_only) {
+    struct sim_relief relief;
+    double slope[2], zero = INFINITY;
+    sim_relief_init(&relief, person);
+    if (!relief_only) {
+        sim_relief_slope(&relief, from_mm[0], from_mm[1], slope);
+        zero = sim_relief_tangent(from_mm, slope, to_mm);
+    }
+    return sim_relief_horizon(&relief, relief_only ? SIM_PART_RELIEF : SIM_PART_ALL, from_mm, to_mm, zero,
+                              INFINITY);
+}
+
+double sim_person_skin_share(const struct sim_person *person, double x_mm, double y_mm, const double to_mm[3],
+                             double lens_radius_mm) {
+    struct sim_relief relief;
+    double skin[3] = {x_mm, y_mm, 0}, slope[2];
+    sim_relief_init(&relief, person);
+    skin[2] = -sim_relief_slope(&relief, x_mm, y_mm, slope);
+    return sim_relief_share(&relief, skin, slope, to_mm, fmax(lens_radius_mm, SIM_LEAST_LENS_MM));
 }
 
 double sim_person_profile_mm(const struct sim_person *person, double angle_deg) {

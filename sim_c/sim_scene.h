@@ -74,6 +74,16 @@ int sim_scene_glint(const struct sim_scene *scene, double azimuth_deg, double el
 // Height of the face over the frontal plane (mm forward of the centre of rotation), for pictures and checks.
 double sim_person_face_mm(const struct sim_person *person, double x_mm, double y_mm);
 
+// H (mm) of sim_face.h: how high a place stands above the horizon that the face makes for a point. relief_only: 0
+// for a point of the skin, with all of the face; 1 for a point above the orbit, without the lids' bulge. For
+// checks and pictures.
+double sim_person_horizon_mm(const struct sim_person *person, const double from_mm[3], const double to_mm[3],
+                             int relief_only);
+
+// Share of a lens that the face leaves to the skin at (x, y), as the skin's term has it.
+double sim_person_skin_share(const struct sim_person *person, double x_mm, double y_mm, const double to_mm[3],
+                             double lens_radius_mm);
+
 // The eye's profile: distance from the centre of rotation at an angle from the optical axis.
 double sim_person_profile_mm(const struct sim_person *person, double angle_deg);
 
