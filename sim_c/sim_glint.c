@@ -2,136 +2,257 @@
 //
 // The glint: light that the eye's front mirrors from an emitter into a sensor,
 //     integral of D(n.h) F(l.h) / 4 * beam / d_l^2 * window / d_v^2 over the surface,
-// D Beckmann's distribution. On a smooth surface with a compact smooth lobe the midpoint rule converges
-// faster than any power of its step, so one uniform rule over (theta, phi) serves everywhere, fold included:
-// along the profile all of it, around the axis only where the lobe is.
+// D Beckmann's distribution. The integral is taken where the lobe is and nowhere else: along the profile over
+// the stretches in which some azimuth's slope is within reach (sim_mirror.h), by Gauss-Legendre panels as
+// long as the slope's change across them allows; around each ring by the midpoint rule, which for a compact
+// smooth lobe converges faster than any power of its step, outward from the least slope until it is out of
+// reach. Cost so depends on the number of lobes, not on their width. Where a site sets behind the eye's own
+// horizon within the lobe, the ring's visible arcs get panels of their own.
 #include <math.h>
-#include <stdlib.h>
 #include <string.h>
 
 #include "sim_inside.h"
 
 #define PI 3.14159265358979323846
-static const double REACH_WIDTHS = 4.2;  // exp(-4.2^2) = 2e-8 of the peak is cut off
-static const double THETA_END = 105 * SIM_RADIANS;
+enum { FEWEST = 3, ARCS = 2 };
 
-struct ring {
-    double rho, sin_theta, cos_theta;
-    double n_out, n_up;  // unit normal: away from the axis, along it
-    double tilt;         // its angle from the axis
-    double area;         // rho * |tangent| * d theta, times sin_theta d phi gives the area
-};
-
-struct pair_view {
+// Of one gaze.
+struct gaze {
     const struct sim_scene *scene;
-    const double *axes, *a, *b;  // site positions, eye frame
-    int site_a, site_b;
-    double alpha2, nearest;  // of the lobe; distance from the apex's sphere to the nearer site
-    const struct sim_lid *lids;
+    double axes[9], sites[2 * SIM_MAX_PORTS][3], widen[2 * SIM_MAX_PORTS];
+    double sensor_aim[SIM_MAX_PORTS][3], emitter_aim[SIM_MAX_PORTS][3];
+    struct sim_lid lids[SIM_MAX_LIDS];
     int n_lids;
     double *out;
 };
 
-static double unit_toward(const double from[3], const double to[3], double u[3]) {
-    for (int k = 0; k < 3; ++k) u[k] = to[k] - from[k];
-    double n = sqrt(sim_dot(u, u));
-    for (int k = 0; k < 3; ++k) u[k] /= n;
-    return n;
+// Of one pair of sites.
+struct pair_view {
+    const struct gaze *gaze;
+    const double *a, *b;  // site positions, eye frame
+    int site_a, site_b;
+    double alpha, alpha2, cut;  // cut: slope^2 / alpha^2 beyond which nothing is taken
+    struct sim_facing start;
+};
+
+static double window_at(const double aim[3], double per_tan2, const double away[3]) {
+    double c = -sim_dot(aim, away);
+    if (c < 0.03) return 0;
+    double t = (1 - c * c) / (c * c) * per_tan2;
+    return t > 40 ? 0 : exp(-t);
 }
 
-static void point_on(const struct ring *ring, double phi, double point[3], double normal[3]) {
-    double c = cos(phi), s = sin(phi), r = ring->rho * ring->sin_theta;
-    point[0] = r * c;
-    point[1] = r * s;
-    point[2] = ring->rho * ring->cos_theta;
-    normal[0] = ring->n_out * c;
-    normal[1] = ring->n_out * s;
-    normal[2] = ring->n_up;
-}
-
-// The azimuth at which the half vector lies in the ring's meridian plane, and the half vector's angle from
-// the axis.
-static double facing_azimuth(const struct pair_view *view, const struct ring *ring, double phi,
-                             double *angle) {
-    double h[3] = {0, 0, 1};
-    for (int i = 0; i < 3; ++i) {
-        double point[3], normal[3], l[3], v[3];
-        point_on(ring, phi, point, normal);
-        unit_toward(point, view->a, l);
-        unit_toward(point, view->b, v);
-        for (int k = 0; k < 3; ++k) h[k] = l[k] + v[k];
-        phi = atan2(h[1], h[0]);
-    }
-    *angle = atan2(sqrt(h[0] * h[0] + h[1] * h[1]), h[2]);
-    return phi;
-}
-
-static void add_point(const struct pair_view *view, const struct ring *ring, double phi, double weight) {
-    const struct sim_scene *scene = view->scene;
-    double point[3], normal[3], l[3], v[3], h[3];
-    point_on(ring, phi, point, normal);
-    double da = unit_toward(point, view->a, l), db = unit_toward(point, view->b, v);
-    if (sim_dot(normal, l) <= 0 || sim_dot(normal, v) <= 0) return;
-    for (int k = 0; k < 3; ++k) h[k] = l[k] + v[k];
-    double n = sqrt(sim_dot(h, h)), c = sim_dot(normal, h) / n;
-    if (c < 0.1) return;
-    double c2 = c * c, slope2 = (1 - c2) / (c2 * view->alpha2);
-    if (slope2 > 30) return;
-    double lobe = exp(-slope2) / (PI * view->alpha2 * c2 * c2);
-    weight *= lobe * sim_fresnel(scene->eye.index, sim_dot(l, h) / n) / (4 * da * da * db * db);
+// The lids' and the face's share of a point: open[lid]. Returns whether anything is left.
+static int openness(const struct pair_view *view, const double point[3], const double l[3], const double v[3],
+                    double *open) {
+    const struct gaze *gaze = view->gaze;
+    const double *axes = gaze->axes;
     double head[3], away[2][3], alpha, beta;
-    const double *axes = view->axes;
     for (int i = 0; i < 3; ++i) {
         head[i] = axes[3 * i] * point[0] + axes[3 * i + 1] * point[1] + axes[3 * i + 2] * point[2];
         away[0][i] = axes[3 * i] * l[0] + axes[3 * i + 1] * l[1] + axes[3 * i + 2] * l[2];
         away[1][i] = axes[3 * i] * v[0] + axes[3 * i + 1] * v[1] + axes[3 * i + 2] * v[2];
     }
     struct sim_lid_point at;
-    double rho = sim_lid_locate(head, &at, &alpha, &beta), open[SIM_MAX_LIDS];
-    weight *= sim_face_eye_reach(&scene->face, view->site_a, alpha, beta);
-    weight *= sim_face_eye_reach(&scene->face, view->site_b, alpha, beta);
-    int any = 0;
-    for (int i = 0; i < view->n_lids; ++i) {
-        sim_lid_measure(&view->lids[i], alpha, beta, rho, &at);
-        open[i] = sim_lid_open_toward(&view->lids[i], &at, away[0]);
-        if (open[i] > 0) open[i] *= sim_lid_open_toward(&view->lids[i], &at, away[1]);
-        any |= open[i] > 0;
+    double rho = sim_lid_locate(head, &at, &alpha, &beta), any = 0;
+    for (int i = 0; i < gaze->n_lids; ++i) {
+        sim_lid_measure(&gaze->lids[i], alpha, beta, rho, &at);
+        open[i] = sim_lid_open_toward(&gaze->lids[i], &at, away[0]);
+        if (open[i] > 0) open[i] *= sim_lid_open_toward(&gaze->lids[i], &at, away[1]);
+        any += open[i];
     }
-    if (!any || weight == 0) return;
+    if (any == 0) return 0;
+    const struct sim_face *face = &gaze->scene->face;
+    double reach = sim_face_eye_reach(face, view->site_a, alpha, beta);
+    if (reach > 0) reach *= sim_face_eye_reach(face, view->site_b, alpha, beta);
+    for (int i = 0; i < gaze->n_lids; ++i) open[i] *= reach;
+    return reach > 0;
+}
+
+// Adds weight times all that varies with the ports.
+static void add_ports(const struct pair_view *view, double weight, const double l[3], const double v[3],
+                      const double *open) {
+    const struct gaze *gaze = view->gaze;
+    const struct sim_scene *scene = gaze->scene;
     int m = scene->n_emitters, pairs = scene->n_sensors * m;
     for (int s = 0; s < scene->n_sensors; ++s) {
         int site = scene->sensors[s].site, here = site == view->site_a;
         if (!here && site != view->site_b) continue;
-        double ws = weight * sim_window_weight(&scene->sensors[s], away[!here]);
+        double ws = window_at(gaze->sensor_aim[s], scene->sensors[s].per_tan2, here ? l : v);
         if (ws == 0) continue;
         for (int e = 0; e < m; ++e) {
             // A pair belongs to this view when its two ends are the view's two sites.
             if (scene->emitters[e].site != (here ? view->site_b : view->site_a)) continue;
-            double w = ws * sim_window_weight(&scene->emitters[e], away[here]);
-            for (int i = 0; i < view->n_lids; ++i) view->out[i * pairs + s * m + e] += w * open[i];
+            double w = window_at(gaze->emitter_aim[e], scene->emitters[e].per_tan2, here ? v : l);
+            w *= ws * weight;
+            for (int i = 0; i < gaze->n_lids; ++i) gaze->out[i * pairs + s * m + e] += w * open[i];
         }
     }
 }
 
-static void add_pair(const struct pair_view *view, const struct ring *rings, int n_rings) {
-    double alpha = sqrt(view->alpha2), phi = 0, step_widths = 1 / view->scene->quality.glint;
-    double mid[3] = {view->a[0] + view->b[0], view->a[1] + view->b[1], view->a[2] + view->b[2]};
-    double start = atan2(mid[1], mid[0]);
-    for (int i = 0; i < n_rings; ++i) {
-        double angle;
-        phi = facing_azimuth(view, &rings[i], start, &angle);
-        if (fabs(angle - rings[i].tilt) > 5 * alpha) continue;
-        // The half vector turns against the normal as phi grows, so the lobe is passed up to 1.6 times
-        // faster.
-        double sine = rings[i].n_out > 1e-9 ? rings[i].n_out : 1e-9;
-        double reach = REACH_WIDTHS * alpha / sine, step = step_widths * alpha / (1.6 * sine);
-        if (reach > PI) reach = PI;
-        int n = (int)ceil(2 * reach / step);
-        if (n < 12) n = 12;
-        step = 2 * reach / n;
-        double weight = rings[i].area * rings[i].sin_theta * step;
-        for (int j = 0; j < n; ++j) add_point(view, &rings[i], phi - reach + (j + 0.5) * step, weight);
+// Adds the integrand at an azimuth (cosine, sine). Returns slope^2 / alpha^2 there, large behind a horizon.
+static double add_point(const struct pair_view *view, const struct sim_ring *ring, double c, double s,
+                        double weight) {
+    double point[3] = {ring->r * c, ring->r * s, ring->z}, l[3], v[3], h[3];
+    double normal[3] = {ring->n_out * c, ring->n_out * s, ring->n_up};
+    for (int k = 0; k < 3; ++k) {
+        l[k] = view->a[k] - point[k];
+        v[k] = view->b[k] - point[k];
     }
+    double da2 = sim_dot(l, l), db2 = sim_dot(v, v), ka = 1 / sqrt(da2), kb = 1 / sqrt(db2);
+    for (int k = 0; k < 3; ++k) {
+        l[k] *= ka;
+        v[k] *= kb;
+        h[k] = l[k] + v[k];
+    }
+    double nl = sim_dot(normal, l), nv = sim_dot(normal, v), hn = nl + nv, h2 = sim_dot(h, h);
+    // |n x h|^2 / (n.h)^2 without the cancellation of 1 - cos^2.
+    double x[3] = {normal[1] * h[2] - normal[2] * h[1], normal[2] * h[0] - normal[0] * h[2],
+                   normal[0] * h[1] - normal[1] * h[0]};
+    double slope2 = hn > 0 ? sim_dot(x, x) / (hn * hn * view->alpha2) : 1e30;
+    if (slope2 > view->cut || nl <= 0 || nv <= 0) return slope2;
+    double open[SIM_MAX_LIDS];
+    if (!openness(view, point, l, v, open)) return slope2;
+    double c2 = hn * hn / h2, lobe = exp(-slope2) / (PI * view->alpha2 * c2 * c2);
+    weight *= lobe * sim_fresnel(view->gaze->scene->eye.index, sqrt(h2) / 2) / (4 * da2 * db2);
+    add_ports(view, weight, l, v, open);
+    return slope2;
+}
+
+// Visible arc of a ring from a site, centred on the site's azimuth: its half width, 0..PI.
+static double arc_seen(const struct sim_ring *ring, const double site[3]) {
+    double flat = ring->n_out * sqrt(site[0] * site[0] + site[1] * site[1]);
+    double level = ring->n_out * ring->r + ring->n_up * (ring->z - site[2]);
+    if (level >= flat) return 0;
+    return level <= -flat ? PI : acos(level / flat);
+}
+
+// The arcs of a ring that see both sites: [from, to] pairs. Returns their number.
+static int arcs_seen(const struct pair_view *view, const struct sim_ring *ring, double arcs[ARCS][2]) {
+    double wa = arc_seen(ring, view->a), wb = arc_seen(ring, view->b);
+    double at = atan2(view->a[1], view->a[0]), off = atan2(view->b[1], view->b[0]) - at;
+    off -= 2 * PI * floor(off / (2 * PI) + 0.5);
+    int n = 0;
+    for (int turn = -1; turn <= 1; ++turn) {
+        double from = fmax(-wa, off + 2 * PI * turn - wb), to = fmin(wa, off + 2 * PI * turn + wb);
+        if (wb >= PI) from = -wa, to = wa;
+        if (to <= from || n == ARCS) continue;
+        arcs[n][0] = at + from;
+        arcs[n++][1] = at + to;
+        if (wb >= PI) break;
+    }
+    return n;
+}
+
+// Points of a Gauss-Legendre panel across which the slope changes by so many lobe widths.
+static int panel_points(const struct sim_scene *scene, double widths) {
+    int n = (int)ceil((2.6 + 1.6 * widths) * sqrt(scene->quality.glint));
+    return n < FEWEST ? FEWEST : n > SIM_MAX_RULE ? SIM_MAX_RULE : n;
+}
+
+static void add_arcs(const struct pair_view *view, const struct sim_ring *ring, double step, double weight) {
+    const struct sim_scene *scene = view->gaze->scene;
+    double arcs[ARCS][2];
+    int n = arcs_seen(view, ring, arcs);
+    for (int i = 0; i < n; ++i) {
+        double width = arcs[i][1] - arcs[i][0], widths = width / step;
+        int panels = (int)ceil(widths / 5), points = panel_points(scene, widths / panels);
+        const double *x = scene->rule[points], *w = x + points;
+        for (int j = 0; j < panels * points; ++j) {
+            double half = width / (2 * panels);
+            double phi = arcs[i][0] + half * (2 * (j / points) + 1 + x[j % points]);
+            add_point(view, ring, cos(phi), sin(phi), weight * half * w[j % points]);
+        }
+    }
+}
+
+static void add_ring(struct pair_view *view, double theta, double weight) {
+    const struct sim_scene *scene = view->gaze->scene;
+    struct sim_ring ring;
+    sim_ring_at(&scene->eye, theta, &ring);
+    sim_ring_face(&ring, view->a, view->b, &view->start);
+    const struct sim_facing *at = &view->start;
+    double reach = sqrt(view->cut) * view->alpha;
+    if (fabs(at->miss) > 1.3 * reach) return;
+    weight *= ring.area;
+    double width = view->alpha / (at->pace + 1e-300), most = 0.6 / (ring.r + 1e-9);
+    if (width > most) width = most;
+    double sine = sqrt(fmax(0, 1 - at->cosine * at->cosine));
+    if (at->cosine < 2 * reach * sine) {
+        add_arcs(view, &ring, width, weight);
+        return;
+    }
+    int n = (int)ceil(2 * PI / (0.9 * width) * sqrt(scene->quality.glint));
+    if (n < 6) n = 6;
+    double step = 2 * PI / n, cs = cos(step), sn = sin(step);
+    weight *= step;
+    double last = add_point(view, &ring, at->c, at->s, weight);
+    for (int side = -1; side <= 1; side += 2) {
+        double c = at->c, s = at->s, before = last;
+        for (int j = 1; j <= (side < 0 ? (n - 1) / 2 : n / 2); ++j) {
+            double turned = c * cs - side * s * sn;
+            s = s * cs + side * c * sn;
+            c = turned;
+            double now = add_point(view, &ring, c, s, weight);
+            if (n > 48 && now > view->cut && now >= before) break;
+            before = now;
+        }
+    }
+}
+
+// How a ring is seen: changes where an arc appears or closes, which is where panels must end.
+static int arcs_kind(const struct pair_view *view, double theta) {
+    struct sim_ring ring;
+    double arcs[ARCS][2];
+    sim_ring_at(&view->gaze->scene->eye, theta, &ring);
+    int full = 4 * (arc_seen(&ring, view->a) >= PI) + 8 * (arc_seen(&ring, view->b) >= PI);
+    return full + arcs_seen(view, &ring, arcs);
+}
+
+static void add_panels(struct pair_view *view, double from, double to, double steepest) {
+    const struct sim_scene *scene = view->gaze->scene;
+    double widths = (to - from) * steepest / view->alpha, length = (to - from) * scene->eye.apex;
+    int panels = (int)ceil(fmax(widths / 7, length / 2.5));
+    if (panels < 1) panels = 1;
+    int points = panel_points(scene, fmax(widths, length / 0.6) / panels);
+    const double *x = scene->rule[points], *w = x + points;
+    double half = (to - from) / (2 * panels);
+    for (int j = 0; j < panels * points; ++j)
+        add_ring(view, from + half * (2 * (j / points) + 1 + x[j % points]), half * w[j % points]);
+}
+
+static void add_stretch(struct pair_view *view, const struct sim_stretch *stretch) {
+    double reach = sqrt(view->cut) * view->alpha, from = stretch->from;
+    // A lobe too narrow to reach any horizon but in grazing light: no arc opens or closes in it that matters.
+    int pieces = reach > 0.3 ? (int)ceil((stretch->to - stretch->from) / 0.04) : 0;
+    for (int i = 0; i < pieces; ++i) {
+        double lo = stretch->from + (stretch->to - stretch->from) * i / pieces;
+        double hi = stretch->from + (stretch->to - stretch->from) * (i + 1) / pieces;
+        int kind = arcs_kind(view, lo);
+        if (arcs_kind(view, hi) == kind) continue;
+        for (int j = 0; j < 40; ++j) {
+            double mid = (lo + hi) / 2;
+            if (arcs_kind(view, mid) == kind) lo = mid;
+            else hi = mid;
+        }
+        add_panels(view, from, lo, stretch->steepest);
+        from = lo;
+    }
+    add_panels(view, from, stretch->to, stretch->steepest);
+}
+
+static void add_pair(struct gaze *gaze, int a, int b) {
+    const struct sim_scene *scene = gaze->scene;
+    double rough = scene->person.roughness, fine = log(scene->quality.glint);
+    struct pair_view view = {.gaze = gaze, .a = gaze->sites[a], .b = gaze->sites[b], .site_a = a, .site_b = b};
+    view.alpha2 = rough * rough + gaze->widen[a] + gaze->widen[b];
+    view.alpha = sqrt(view.alpha2);
+    view.cut = fmin(fmax(12 + 6 * fine, 5), 30);
+    sim_facing_start(view.a, view.b, &view.start);
+    struct sim_stretch stretches[SIM_STRETCHES];
+    int n = sim_profile_scan(&scene->profile, &scene->eye, view.a, view.b,
+                             1.15 * sqrt(view.cut) * view.alpha, stretches);
+    for (int i = 0; i < n; ++i) add_stretch(&view, &stretches[i]);
 }
 
 static int pair_used(const struct sim_scene *scene, int a, int b) {
@@ -143,68 +264,37 @@ static int pair_used(const struct sim_scene *scene, int a, int b) {
     return (sa && eb) || (sb && ea);
 }
 
+static void turn_to_eye(const double axes[9], const double head[3], double eye[3]) {
+    for (int j = 0; j < 3; ++j) eye[j] = axes[j] * head[0] + axes[3 + j] * head[1] + axes[6 + j] * head[2];
+}
+
 int sim_scene_glint(const struct sim_scene *scene, double azimuth_deg, double elevation_deg,
                     const double *lid_opening, int n_lids, double *out) {
     if (n_lids < 1 || n_lids > SIM_MAX_LIDS || !(fabs(azimuth_deg) <= 60 && fabs(elevation_deg) <= 60))
         return -1;
-    struct sim_lid lids[SIM_MAX_LIDS];
+    struct gaze gaze;
+    gaze.scene = scene;
+    gaze.n_lids = n_lids;
+    gaze.out = out;
     for (int i = 0; i < n_lids; ++i) {
         if (!(lid_opening[i] >= 0 && lid_opening[i] <= 1)) return -1;
-        sim_lid_pose(&lids[i], &scene->person, elevation_deg, lid_opening[i]);
+        sim_lid_pose(&gaze.lids[i], &scene->person, elevation_deg, lid_opening[i]);
     }
     memset(out, 0, (size_t)(n_lids * scene->n_sensors * scene->n_emitters) * sizeof *out);
-    double axes[9], sites[2 * SIM_MAX_PORTS][3], nearest = 1e9, away[2 * SIM_MAX_PORTS];
+    sim_eye_orient(&scene->eye, azimuth_deg, elevation_deg, gaze.axes);
     for (int k = 0; k < scene->n_sites; ++k) {
-        away[k] = sqrt(sim_dot(scene->sites[k].position, scene->sites[k].position)) - scene->eye.apex;
-        if (away[k] < nearest) nearest = away[k];
-    }
-    double step = 0.5 / scene->quality.glint * SIM_RADIANS;
-    if (nearest < scene->eye.apex) step *= nearest / scene->eye.apex;  // half vectors turn faster near a site
-    if (step < 2e-5) step = 2e-5;
-    int n_rings = (int)ceil(THETA_END / step);
-    struct ring *rings = malloc((size_t)n_rings * sizeof *rings);
-    if (!rings) return -1;
-    for (int i = 0; i < n_rings; ++i) {
-        double theta = (i + 0.5) * step, d;
-        struct ring *r = &rings[i];
-        r->sin_theta = sin(theta);
-        r->cos_theta = cos(theta);
-        r->rho = sim_eye_rho(&scene->eye, r->sin_theta, r->cos_theta, &d);
-        double length = sqrt(r->rho * r->rho + d * d);
-        r->n_out = (r->rho * r->sin_theta - d * r->cos_theta) / length;
-        r->n_up = (r->rho * r->cos_theta + d * r->sin_theta) / length;
-        r->tilt = atan2(r->n_out, r->n_up);
-        r->area = r->rho * length * step;
-    }
-    sim_eye_orient(&scene->eye, azimuth_deg, elevation_deg, axes);
-    for (int k = 0; k < scene->n_sites; ++k)
-        for (int j = 0; j < 3; ++j) {
-            const double *p = scene->sites[k].position;
-            sites[k][j] = axes[j] * p[0] + axes[3 + j] * p[1] + axes[6 + j] * p[2];
-        }
-    double widen[2 * SIM_MAX_PORTS];
-    for (int k = 0; k < scene->n_sites; ++k) {
-        double d[3] = {sites[k][0], sites[k][1], sites[k][2] - scene->eye.apex + scene->eye.radius};
+        double *at = gaze.sites[k];
+        turn_to_eye(gaze.axes, scene->sites[k].position, at);
+        double d[3] = {at[0], at[1], at[2] - scene->eye.apex + scene->eye.radius};
         double half = scene->sites[k].radius / (2 * (sqrt(sim_dot(d, d)) - 0.9 * scene->eye.radius));
-        widen[k] = half * half / 2;
+        gaze.widen[k] = half * half / 2;
     }
+    for (int s = 0; s < scene->n_sensors; ++s)
+        turn_to_eye(gaze.axes, scene->sensors[s].aim, gaze.sensor_aim[s]);
+    for (int e = 0; e < scene->n_emitters; ++e)
+        turn_to_eye(gaze.axes, scene->emitters[e].aim, gaze.emitter_aim[e]);
     for (int a = 0; a < scene->n_sites; ++a)
-        for (int b = a; b < scene->n_sites; ++b) {
-            if (!pair_used(scene, a, b)) continue;
-            double rough = scene->person.roughness;
-            struct pair_view view = {.scene = scene,
-                                     .axes = axes,
-                                     .a = sites[a],
-                                     .b = sites[b],
-                                     .site_a = a,
-                                     .site_b = b,
-                                     .alpha2 = rough * rough + widen[a] + widen[b],
-                                     .nearest = away[a] < away[b] ? away[a] : away[b],
-                                     .lids = lids,
-                                     .n_lids = n_lids,
-                                     .out = out};
-            add_pair(&view, rings, n_rings);
-        }
-    free(rings);
+        for (int b = a; b < scene->n_sites; ++b)
+            if (pair_used(scene, a, b)) add_pair(&gaze, a, b);
     return 0;
 }

@@ -5,6 +5,7 @@
 #define SIM_INSIDE_H
 
 #include "sim_face.h"
+#include "sim_mirror.h"
 #include "sim_scene.h"
 
 #define SIM_RADIANS (3.14159265358979323846 / 180)
@@ -46,6 +47,7 @@ struct sim_scene {
     const double *gauss[4];
     int gauss_nodes[4];
     const double *rule[SIM_MAX_RULE + 1];  // rule[n]: Gauss-Legendre's n abscissas on -1..1, n weights
+    struct sim_profile profile;            // of the eye, for the glint
     double *face_all;    // [sensors][emitters] response of all skin with the lids closed
     double *face_spots;  // [n_lid_spots][sensors + emitters], of what an open eye may replace
     struct sim_lid_spot *lid_spots;

@@ -142,6 +142,7 @@ static int prepare(struct sim_scene *scene, char *error, size_t bytes) {
         scene->gauss[i] = at;
         at += 2 * scene->gauss_nodes[i];
     }
+    sim_profile_init(&scene->profile, &scene->eye);
     double sites[2 * SIM_MAX_PORTS][3], radius[2 * SIM_MAX_PORTS];
     for (int k = 0; k < scene->n_sites; ++k) {
         memcpy(sites[k], scene->sites[k].position, sizeof sites[k]);

@@ -23,6 +23,7 @@ SOURCES = (
     "sim_face.c",
     "sim_skin.c",
     "sim_diffuse.c",
+    "sim_mirror.c",
     "sim_glint.c",
     "sim_scene.c",
     "sim_image.c",

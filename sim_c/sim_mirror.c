@@ -1,0 +1,215 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "sim_mirror.h"
+
+#include <math.h>
+#include <string.h>
+
+#define PI 3.14159265358979323846
+static const double THETA_END = 105 * PI / 180;
+enum { MOST_HALVINGS = 40 };
+
+void sim_ring_at(const struct sim_eye *eye, double theta, struct sim_ring *ring) {
+    double s = sin(theta), c = cos(theta), d, rho = sim_eye_rho(eye, s, c, &d);
+    double length = sqrt(rho * rho + d * d);
+    ring->theta = theta;
+    ring->r = rho * s;
+    ring->z = rho * c;
+    ring->n_out = (rho * s - d * c) / length;
+    ring->n_up = (rho * c + d * s) / length;
+    ring->along = length;
+    ring->area = length * ring->r;
+}
+
+// Distance of the unblended cornea from the globe along the ray at theta.
+static double gap_at(const struct sim_eye *eye, double theta) {
+    struct sim_eye bare = *eye;
+    double d;
+    bare.blend = 1e-30;
+    bare.globe = 0;
+    return sim_eye_rho(&bare, sin(theta), cos(theta), &d) - eye->globe;
+}
+
+void sim_profile_init(struct sim_profile *profile, const struct sim_eye *eye) {
+    double ends[SIM_PROFILE_PIECES + 1];
+    int n = 0, steps = 420;
+    ends[n++] = 0;
+    for (int i = 0; i < steps; ++i) {
+        double from = THETA_END * i / steps, to = THETA_END * (i + 1) / steps, found[3];
+        int roots = 0;
+        for (int k = -1; k <= 1; ++k) {
+            double lo = from, hi = to, level = k * eye->blend, at_lo = gap_at(eye, lo) - level;
+            if ((at_lo > 0) == (gap_at(eye, hi) - level > 0)) continue;
+            for (int j = 0; j < 60; ++j) {
+                double mid = (lo + hi) / 2;
+                if ((gap_at(eye, mid) - level > 0) == (at_lo > 0)) lo = mid;
+                else hi = mid;
+            }
+            found[roots++] = hi;
+        }
+        for (int done = 0; done < roots; ++done) {  // in order, and none twice
+            double next = THETA_END;
+            for (int k = 0; k < roots; ++k)
+                if (found[k] > ends[n - 1] + 1e-9 && found[k] < next) next = found[k];
+            if (next < THETA_END - 1e-9 && n < SIM_PROFILE_PIECES) ends[n++] = next;
+        }
+    }
+    ends[n] = THETA_END;
+    profile->n_pieces = n;
+    profile->n_rings = 0;
+    for (int p = 0; p < n; ++p) {
+        profile->first[p] = profile->n_rings;
+        double width = ends[p + 1] - ends[p];
+        int cells = (int)ceil(width * (p + 1 < n ? 26 : 15));
+        if (cells < 5) cells = 5;
+        int room = SIM_PROFILE_RINGS - 1 - profile->n_rings - 6 * (n - 1 - p);
+        if (cells > room) cells = room;
+        for (int i = 0; i <= cells; ++i)
+            sim_ring_at(eye, ends[p] + width * i / cells, &profile->rings[profile->n_rings++]);
+    }
+    profile->first[n] = profile->n_rings;
+}
+
+void sim_facing_start(const double a[3], const double b[3], struct sim_facing *facing) {
+    double da = sqrt(sim_dot(a, a)), db = sqrt(sim_dot(b, b));
+    double x = a[0] / da + b[0] / db, y = a[1] / da + b[1] / db, n = sqrt(x * x + y * y);
+    facing->c = n > 1e-12 ? x / n : 1;
+    facing->s = n > 1e-12 ? y / n : 0;
+}
+
+void sim_ring_face(const struct sim_ring *ring, const double a[3], const double b[3],
+                   struct sim_facing *facing) {
+    double r = ring->r, out = ring->n_out, up = ring->n_up, az = a[2] - ring->z, bz = b[2] - ring->z;
+    double c = facing->c, s = facing->s;
+    for (int i = 0;; ++i) {
+        // Outward, around and up, of unit vectors to the sites from the ring's point at this azimuth.
+        double ar = a[0] * c + a[1] * s - r, at = a[1] * c - a[0] * s;
+        double br = b[0] * c + b[1] * s - r, bt = b[1] * c - b[0] * s;
+        double ka = 1 / sqrt(ar * ar + at * at + az * az), kb = 1 / sqrt(br * br + bt * bt + bz * bz);
+        double lr = ar * ka, lt = at * ka, lz = az * ka, vr = br * kb, vt = bt * kb, vz = bz * kb;
+        double hr = lr + vr, ht = lt + vt, hz = lz + vz;
+        // Their derivatives by the azimuth, in the frame that turns along.
+        double turn_a = r * ka * lt, turn_b = r * kb * vt;
+        double dr = lr * turn_a + lt + vr * turn_b + vt;
+        double dt = lt * turn_a - r * ka - lr + vt * turn_b - r * kb - vr;
+        double dz = lz * turn_a + vz * turn_b;
+        double hn = hr * out + hz * up, hm = hr * up - hz * out, size = sqrt(hr * hr + ht * ht + hz * hz);
+        facing->cosine = size / 2;
+        if (hn < 1e-3 * size) {  // behind: as good as infinitely far off
+            facing->c = c;
+            facing->s = s;
+            facing->pace = 1;
+            facing->miss = hm > 0 ? 1e3 : -1e3;
+            return;
+        }
+        double dn = dr * out + dz * up, sm = hm / hn, st = ht / hn;
+        double dm = (dr * up - dz * out - sm * dn) / hn;
+        dt = (dt - st * dn) / hn;
+        double pace2 = dm * dm + dt * dt, pace = sqrt(pace2);
+        facing->pace = pace;
+        facing->miss = (st * dm - sm * dt) / (pace + 1e-300);
+        double x = pace2 > 1e-24 ? -(sm * dm + st * dt) / pace2 : 0;
+        if (fabs(x) < 2e-3 || i == 12) {
+            facing->c = c - x * s;
+            facing->s = s + x * c;
+            double n = 1 / sqrt(facing->c * facing->c + facing->s * facing->s);
+            facing->c *= n;
+            facing->s *= n;
+            return;
+        }
+        if (x > 0.5) x = 0.5;
+        if (x < -0.5) x = -0.5;
+        double cx = cos(x), sx = sin(x), turned = c * cx - s * sx;
+        s = s * cx + c * sx;
+        c = turned;
+    }
+}
+
+// The miss as a sine, which stays finite where a ring turns away.
+struct node {
+    double theta, miss;
+    struct sim_facing facing;
+};
+
+struct scan {
+    const struct sim_eye *eye;
+    const double *a, *b;
+    double reach;
+    struct sim_stretch *out;
+    int n, open;  // stretches so far; whether the last one is in this piece
+};
+
+static struct node node_at(const struct scan *scan, const struct sim_ring *ring,
+                           const struct sim_facing *start) {
+    struct node node = {.theta = ring->theta, .facing = *start};
+    sim_ring_face(ring, scan->a, scan->b, &node.facing);
+    node.miss = node.facing.miss / sqrt(1 + node.facing.miss * node.facing.miss);
+    return node;
+}
+
+static void take_cell(struct scan *scan, const struct node *lo, const struct node *hi) {
+    double width = hi->theta - lo->theta, change = hi->miss - lo->miss, from = lo->theta, to = hi->theta;
+    // Linear ends of the reach, a little too wide.
+    double edge = 1.03 * scan->reach;
+    if (fabs(lo->miss) > edge && lo->miss * change < 0) {
+        double t = (fabs(lo->miss) - edge) / fabs(change);
+        if (t < 0.98) from += t * width;
+    }
+    if (fabs(hi->miss) > edge && hi->miss * change > 0) {
+        double t = (fabs(hi->miss) - edge) / fabs(change);
+        if (t < 0.98) to -= t * width;
+    }
+    struct sim_stretch *last = scan->n ? &scan->out[scan->n - 1] : NULL;
+    int joined = scan->open && last && (from - last->to < 1e-12 || scan->n == SIM_STRETCHES);
+    if (!joined) {
+        last = &scan->out[scan->n++];
+        last->from = from;
+        last->steepest = 0;
+        last->crossings = 0;
+    }
+    last->to = to;
+    double steep = fabs(change) / width;
+    if (steep > last->steepest) last->steepest = steep;
+    last->crossings += (lo->miss > 0) != (hi->miss > 0);
+    scan->open = 1;
+}
+
+static void halve(struct scan *scan, const struct node *lo, const struct node *hi, double bend, int depth) {
+    double width = hi->theta - lo->theta, dip = bend * width * width / 4;  // twice the parabola's
+    double least = (lo->miss > 0) != (hi->miss > 0) ? 0 : fmin(fabs(lo->miss), fabs(hi->miss));
+    if (least - dip > scan->reach) return;
+    if (depth == MOST_HALVINGS || fabs(hi->miss - lo->miss) + dip < 1.2 * scan->reach || width < 1e-12) {
+        take_cell(scan, lo, hi);
+        return;
+    }
+    struct sim_ring ring;
+    sim_ring_at(scan->eye, (lo->theta + hi->theta) / 2, &ring);
+    struct node mid = node_at(scan, &ring, &lo->facing);
+    double here = 4 * fabs(lo->miss - 2 * mid.miss + hi->miss) / (width * width);
+    bend = fmax(here, bend / 4);
+    halve(scan, lo, &mid, bend, depth + 1);
+    halve(scan, &mid, hi, bend, depth + 1);
+}
+
+int sim_profile_scan(const struct sim_profile *profile, const struct sim_eye *eye, const double a[3],
+                     const double b[3], double reach, struct sim_stretch *out) {
+    struct scan scan = {.eye = eye, .a = a, .b = b, .reach = reach / sqrt(1 + reach * reach), .out = out};
+    struct node nodes[SIM_PROFILE_RINGS];
+    struct sim_facing start;
+    sim_facing_start(a, b, &start);
+    for (int p = 0; p < profile->n_pieces; ++p) {
+        int first = profile->first[p], cells = profile->first[p + 1] - first - 1;
+        for (int i = 0; i <= cells; ++i) {
+            nodes[i] = node_at(&scan, &profile->rings[first + i], &start);
+            start = nodes[i].facing;
+        }
+        double width = nodes[1].theta - nodes[0].theta;
+        scan.open = 0;
+        for (int i = 0; i < cells; ++i) {
+            double bend = 0;
+            for (int k = i > 0 ? i - 1 : 0; k <= i && k + 2 <= cells; ++k)
+                bend = fmax(bend, fabs(nodes[k].miss - 2 * nodes[k + 1].miss + nodes[k + 2].miss));
+            halve(&scan, &nodes[i], &nodes[i + 1], bend / (width * width), 0);
+        }
+    }
+    return scan.n;
+}

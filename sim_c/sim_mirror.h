@@ -1,0 +1,63 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The eye's outside as a mirror: its rings about the optical axis, which of them come near to mirroring one
+// site into another, and the points that do. Eye frame (sim_eye.h); mm and radians.
+//
+// Slope     of the half vector h = l + v of the unit vectors to two sites, against the unit normal n: its
+//           tangential part over n.h. A mirror point has slope 0; Beckmann's lobe is exp(-slope^2 / alpha^2).
+// Miss      each ring has one azimuth where the slope is least; that slope, positive when h leans further out
+//           than n, is the ring's miss. It starts positive on the axis and ends negative behind, so its roots,
+//           the mirror points, are odd in number; where it only touches zero is the fold at the limbus.
+#ifndef SIM_MIRROR_H
+#define SIM_MIRROR_H
+
+#include "sim_eye.h"
+
+enum { SIM_PROFILE_RINGS = 128, SIM_PROFILE_PIECES = 16, SIM_STRETCHES = 64 };
+
+struct sim_ring {
+    double theta, r, z;   // polar angle; the ring's radius and height
+    double n_out, n_up;   // unit normal: away from the axis, along it
+    double along, area;   // arc length along the profile per d theta; area per d theta d phi
+};
+
+// The profile's analytic pieces, which end where the limbus' blend begins, is centred and ends, and rings in
+// each of them.
+struct sim_profile {
+    int n_rings, n_pieces;
+    int first[SIM_PROFILE_PIECES + 1];  // ring that starts each piece; a piece has its own ring at both ends
+    struct sim_ring rings[SIM_PROFILE_RINGS];
+};
+
+// Where a ring comes nearest to mirroring one site into the other.
+struct sim_facing {
+    double c, s;     // cosine and sine of the azimuth; on entry of sim_ring_face() where to start
+    double miss;     // signed slope there
+    double pace;     // change of slope per radian around the ring
+    double cosine;   // of incidence, of light mirrored by the half vector
+};
+
+// Part of the profile where the miss is within reach.
+struct sim_stretch {
+    double from, to;    // theta
+    double steepest;    // largest |d sine of miss / d theta| in it
+    int crossings;      // roots of the miss in it
+};
+
+void sim_ring_at(const struct sim_eye *eye, double theta, struct sim_ring *ring);
+
+void sim_profile_init(struct sim_profile *profile, const struct sim_eye *eye);
+
+// Newton's way to the azimuth of least slope. Start anywhere in the half that faces the sites.
+void sim_ring_face(const struct sim_ring *ring, const double a[3], const double b[3],
+                   struct sim_facing *facing);
+
+// Azimuth to start from: the sites' mean direction.
+void sim_facing_start(const double a[3], const double b[3], struct sim_facing *facing);
+
+// All stretches in which |miss| <= reach: the profile's rings first, then halved cells wherever the miss may
+// dip within reach between them. Returns their number, at most SIM_STRETCHES.
+int sim_profile_scan(const struct sim_profile *profile, const struct sim_eye *eye, const double a[3],
+                     const double b[3], double reach, struct sim_stretch *out);
+
+#endif
