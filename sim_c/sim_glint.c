@@ -166,6 +166,28 @@ static void add_arcs(const struct pair_view *view, const struct sim_ring *ring, 
     }
 }
 
+// Adds points of equal steps from an azimuth to both sides, steps low..high; stops, if it may, where the lobe
+// is out of reach and getting further. On return low..high are the steps taken.
+static void march(const struct pair_view *view, const struct sim_ring *ring, const struct sim_facing *at,
+                  double step, int may_stop, double weight, int *low, int *high) {
+    double cs = cos(step), sn = sin(step), middle = add_point(view, ring, at->c, at->s, weight);
+    for (int side = -1; side <= 1; side += 2) {
+        double c = at->c, s = at->s, before = middle;
+        int last = side < 0 ? -*low : *high;
+        for (int j = 1; j <= last; ++j) {
+            double turned = c * cs - side * s * sn;
+            s = s * cs + side * c * sn;
+            c = turned;
+            double now = add_point(view, ring, c, s, weight);
+            if (may_stop && now > view->cut && now >= before) {
+                *(side < 0 ? low : high) = side * j;
+                break;
+            }
+            before = now;
+        }
+    }
+}
+
 static void add_ring(struct pair_view *view, double theta, double weight) {
     const struct sim_scene *scene = view->gaze->scene;
     struct sim_ring ring;
@@ -184,20 +206,27 @@ static void add_ring(struct pair_view *view, double theta, double weight) {
     }
     int n = (int)ceil(2 * PI / (0.9 * width) * sqrt(scene->quality.glint));
     if (n < 6) n = 6;
-    double step = 2 * PI / n, cs = cos(step), sn = sin(step);
-    weight *= step;
-    double last = add_point(view, &ring, at->c, at->s, weight);
-    for (int side = -1; side <= 1; side += 2) {
-        double c = at->c, s = at->s, before = last;
-        for (int j = 1; j <= (side < 0 ? (n - 1) / 2 : n / 2); ++j) {
-            double turned = c * cs - side * s * sn;
-            s = s * cs + side * c * sn;
-            c = turned;
-            double now = add_point(view, &ring, c, s, weight);
-            if (n > 48 && now > view->cut && now >= before) break;
-            before = now;
-        }
+    double step = 2 * PI / n;
+    int low = -((n - 1) / 2), high = n / 2;
+    if (n <= 48) {
+        march(view, &ring, at, step, 0, weight * step, &low, &high);
+        return;
     }
+    int covered[2] = {low, high};
+    march(view, &ring, at, step, 1, weight * step, &covered[0], &covered[1]);
+    if (at->pace > 6 * reach) return;
+    // Round the axis, where the lobe may lie across the ring, a second azimuth may be as near.
+    struct sim_facing other = {.c = -at->c, .s = -at->s};
+    sim_ring_face(&ring, view->a, view->b, &other);
+    double angle = atan2(other.s * at->c - other.c * at->s, other.c * at->c + other.s * at->s);
+    int index = (int)floor(angle / step + 0.5), from = covered[1] + 1, to = covered[0] - 1 + n;
+    if (index < covered[0]) index += n;
+    if (fabs(other.miss) > 1.3 * reach || index < from || index > to) return;
+    other.c = at->c * cos(index * step) - at->s * sin(index * step);
+    other.s = at->s * cos(index * step) + at->c * sin(index * step);
+    low = from - index;
+    high = to - index;
+    march(view, &ring, &other, step, 1, weight * step, &low, &high);
 }
 
 // How a ring is seen: changes where an arc appears or closes, which is where panels must end.

@@ -94,6 +94,7 @@ void sim_ring_face(const struct sim_ring *ring, const double a[3], const double 
         double dz = lz * turn_a + vz * turn_b;
         double hn = hr * out + hz * up, hm = hr * up - hz * out, size = sqrt(hr * hr + ht * ht + hz * hz);
         facing->cosine = size / 2;
+        facing->nearest = 1 / fmax(ka, kb);
         if (hn < 1e-3 * size) {  // behind: as good as infinitely far off
             facing->c = c;
             facing->s = s;
@@ -108,7 +109,7 @@ void sim_ring_face(const struct sim_ring *ring, const double a[3], const double 
         facing->pace = pace;
         facing->miss = (st * dm - sm * dt) / (pace + 1e-300);
         double x = pace2 > 1e-24 ? -(sm * dm + st * dt) / pace2 : 0;
-        if (fabs(x) < 2e-3 || i == 12) {
+        if (fabs(x) * fmax(1, pace) < 2e-3 || i == 12) {
             facing->c = c - x * s;
             facing->s = s + x * c;
             double n = 1 / sqrt(facing->c * facing->c + facing->s * facing->s);
@@ -176,8 +177,11 @@ static void take_cell(struct scan *scan, const struct node *lo, const struct nod
 static void halve(struct scan *scan, const struct node *lo, const struct node *hi, double bend, int depth) {
     double width = hi->theta - lo->theta, dip = bend * width * width / 4;  // twice the parabola's
     double least = (lo->miss > 0) != (hi->miss > 0) ? 0 : fmin(fabs(lo->miss), fabs(hi->miss));
-    if (least - dip > scan->reach) return;
-    if (depth == MOST_HALVINGS || fabs(hi->miss - lo->miss) + dip < 1.2 * scan->reach || width < 1e-12) {
+    // Half vectors turn fast near a site: only cells short against its distance tell by their ends.
+    int coarse = width * scan->eye->apex > 0.4 * fmin(lo->facing.nearest, hi->facing.nearest);
+    if (least - dip > scan->reach && !coarse) return;
+    if (depth == MOST_HALVINGS || (!coarse && fabs(hi->miss - lo->miss) + dip < 1.2 * scan->reach) ||
+        width < 1e-12) {
         take_cell(scan, lo, hi);
         return;
     }

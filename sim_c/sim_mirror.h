@@ -35,6 +35,7 @@ struct sim_facing {
     double miss;     // signed slope there
     double pace;     // change of slope per radian around the ring
     double cosine;   // of incidence, of light mirrored by the half vector
+    double nearest;  // distance of the nearer site
 };
 
 // Part of the profile where the miss is within reach.

@@ -59,7 +59,7 @@ def sphere_glint(centre, radius, sensor, emitter, index):
         return np.linalg.norm(point(q) - s) + np.linalg.norm(point(q) - e)
 
     q = minimize(length, [0.0, 0.0], method="Nelder-Mead", options={"xatol": 1e-11, "fatol": 1e-15}).x
-    h = 1e-3 * radius
+    h = 1e-3 * min(radius, np.linalg.norm(point(q) - s), np.linalg.norm(point(q) - e))
     d = np.eye(2) * h
     second = np.array(
         [
@@ -137,10 +137,10 @@ def test_a_very_large_cornea_is_a_flat_mirror():
     cosine = 10 / np.hypot(3, 10)
     flat = fresnel(person.refractive_index, cosine) / (4 * (9 + 100)) * window(sensor, (0, 0, -apex)) ** 2
     got = scene.glint(0, 0, 1.0)[0, 0, 0]
-    assert got == pytest.approx(flat, rel=0.025)
+    assert got == pytest.approx(flat, rel=0.028)
     centre, radius = np.array([0, 0, 780.0 - apex]), 780.0
     assert got == pytest.approx(
-        sphere_glint(centre, radius, sensor, emitter, person.refractive_index), rel=0.005
+        sphere_glint(centre, radius, sensor, emitter, person.refractive_index), rel=1e-3
     )
 
 
