@@ -197,7 +197,9 @@ static void add_ring(struct pair_view *view, double theta, double weight) {
     double reach = sqrt(view->cut) * view->alpha;
     if (fabs(at->miss) > 1.3 * reach) return;
     weight *= ring.area;
-    double width = view->alpha / (at->pace + 1e-300), most = 0.6 / (ring.r + 1e-9);
+    // Round the axis the lobe lies across the ring, and the slope is nowhere steep but turns.
+    int axial = at->pace < 6 * reach;
+    double width = view->alpha / (at->pace + axial * fabs(at->miss) + 1e-9), most = 0.6 / (ring.r + 1e-9);
     if (width > most) width = most;
     double sine = sqrt(fmax(0, 1 - at->cosine * at->cosine));
     if (at->cosine < 2 * reach * sine) {
@@ -205,7 +207,7 @@ static void add_ring(struct pair_view *view, double theta, double weight) {
         return;
     }
     int n = (int)ceil(2 * PI / (0.9 * width) * sqrt(scene->quality.glint));
-    if (n < 6) n = 6;
+    if (n < 10) n = 10;
     double step = 2 * PI / n;
     int low = -((n - 1) / 2), high = n / 2;
     if (n <= 48) {
@@ -214,8 +216,8 @@ static void add_ring(struct pair_view *view, double theta, double weight) {
     }
     int covered[2] = {low, high};
     march(view, &ring, at, step, 1, weight * step, &covered[0], &covered[1]);
-    if (at->pace > 6 * reach) return;
-    // Round the axis, where the lobe may lie across the ring, a second azimuth may be as near.
+    if (!axial) return;
+    // A second azimuth may be as near.
     struct sim_facing other = {.c = -at->c, .s = -at->s};
     sim_ring_face(&ring, view->a, view->b, &other);
     double angle = atan2(other.s * at->c - other.c * at->s, other.c * at->c + other.s * at->s);
