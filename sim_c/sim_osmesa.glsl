@@ -344,7 +344,7 @@ float skin(vec3 ray) {
         while (t < end && !(ga > 0.0 && gb <= 0.0)) {
             a = t;
             ga = gap;
-            t = min(t + max(0.25, 0.3 * gap), end);
+            t = min(t + (gap > 0.0 ? 0.06 + 0.3 * gap : 0.25), end);  // a grazing ray is soon through
             p = camera + t * ray;
             gap = -p.z - face(p.xy);
             b = t;
