@@ -311,9 +311,12 @@ static double beam_of(const struct look *look, int e, const double away[3]) {
     return sim_window_weight(&look->image->scene->emitters[look->image->emitters[e]], away);
 }
 
-static void add_light(const struct look *look, int e, double light) {
-    size_t n = (size_t)look->image->camera.pixels;
-    look->radiance[(size_t)e * n * n + (size_t)look->pixel] += light;
+enum { FACE, SCLERA, IRIS, GLINT };
+
+static void add_light(const struct look *look, int part, int e, double light) {
+    size_t n = (size_t)look->image->camera.pixels, plane = (size_t)e;
+    if (look->terms & SIM_IMAGE_APART) plane += (size_t)(part * look->image->n_emitters);
+    look->radiance[plane * n * n + (size_t)look->pixel] += light;
 }
 
 // Sclera and glint where a ray enters the eye.
@@ -341,7 +344,7 @@ static void add_surface(const struct look *look, const double point[3], const do
         if (beam == 0 || (by_rays && eye_between(look, point, normal, site))) continue;
         if (seen > 0) {
             double bulge = by_rays ? 1 : past_bulge(look, head, &lamp, site);
-            add_light(look, e, scene->person.albedo_sclera / PI * white * seen * lit * beam * bulge);
+            add_light(look, SCLERA, e, scene->person.albedo_sclera / PI * white * seen * lit * beam * bulge);
         }
         if (!(look->terms & SIM_IMAGE_GLINT) || sim_dot(up, away) <= 0) continue;
         double h[3];
@@ -353,7 +356,7 @@ static void add_surface(const struct look *look, const double point[3], const do
         if (c < 0.1 || slope2 > 30) continue;
         double lobe = exp(-slope2) / (PI * alpha2 * c2 * c2);
         double mirrored = lobe * sim_fresnel(scene->eye.index, sim_dot(away, h) / size) / (4 * facing);
-        add_light(look, e, mirrored * view.open * beam / (distance * distance));
+        add_light(look, GLINT, e, mirrored * view.open * beam / (distance * distance));
     }
 }
 
@@ -397,7 +400,7 @@ static void add_iris(const struct look *look, const double ray[3]) {
         to_head(look->axes, exit, head);
         look_at(look, head, site, by_rays, &lamp);
         lit *= lamp.open * beam_of(look, e, lamp.away);
-        add_light(look, e, scene->person.albedo_iris / PI * seen * lit);
+        add_light(look, IRIS, e, scene->person.albedo_iris / PI * seen * lit);
     }
 }
 
@@ -431,7 +434,7 @@ static void add_face(struct look *look) {
         }
         look->pixel = s->pixel;
         for (int e = 0; e < image->n_emitters; ++e)
-            add_light(look, e, shown * image->skin_light[(size_t)i * (size_t)image->n_emitters + (size_t)e]);
+            add_light(look, FACE, e, shown * image->skin_light[(size_t)i * (size_t)image->n_emitters + (size_t)e]);
     }
 }
 
@@ -441,7 +444,8 @@ int sim_image_render(const struct sim_image *image, double azimuth_deg, double e
     size_t n = (size_t)image->camera.pixels;
     struct look look = {.image = image, .pupil_radius = pupil_mm / 2, .terms = terms, .radiance = radiance};
     if (sim_image_bad_state(scene, azimuth_deg, elevation_deg, pupil_mm, lid_opening)) return -1;
-    memset(radiance, 0, (size_t)image->n_emitters * n * n * sizeof *radiance);
+    size_t planes = (size_t)image->n_emitters * (terms & SIM_IMAGE_APART ? 4 : 1);
+    memset(radiance, 0, planes * n * n * sizeof *radiance);
     sim_eye_orient(&scene->eye, azimuth_deg, elevation_deg, look.axes);
     sim_lid_pose(&look.lid, &scene->person, elevation_deg, lid_opening);
     to_eye(look.axes, image->camera.position, look.camera_eye);
@@ -450,6 +454,6 @@ int sim_image_render(const struct sim_image *image, double azimuth_deg, double e
         look.widen[k] = sim_image_widen(scene, look.axes, k);
     }
     if (terms & SIM_TERM_FACE) add_face(&look);
-    if (terms & ~SIM_TERM_FACE) add_eye(&look);
+    if (terms & (SIM_IMAGE_ALL - SIM_TERM_FACE)) add_eye(&look);
     return 0;
 }

@@ -21,7 +21,8 @@
 #include "sim_scene.h"
 
 // cdef begin
-enum { SIM_IMAGE_GLINT = 8, SIM_IMAGE_ALL = 15, SIM_IMAGE_MAX_PIXELS = 4096 };  // further: SIM_TERM_*
+// Terms besides SIM_TERM_*; APART: each in an image of its own.
+enum { SIM_IMAGE_GLINT = 8, SIM_IMAGE_ALL = 15, SIM_IMAGE_APART = 16, SIM_IMAGE_MAX_PIXELS = 4096 };
 
 // What hides what.
 //   SOFT  as sim_scene.h has it: a lens of finite size sets behind the face's horizon and behind the corneal
@@ -42,7 +43,8 @@ struct sim_image *sim_image_open(const struct sim_scene *scene, int sensor, cons
                                  char *error, size_t error_bytes);
 void sim_image_close(struct sim_image *image);  // NULL allowed
 
-// radiance [n_emitters][pixels][pixels] receives the sum of the chosen terms. Reentrant.
+// radiance [n_emitters][pixels][pixels] receives the sum of the chosen terms; with SIM_IMAGE_APART
+// [face, sclera, iris, glint][n_emitters][pixels][pixels]. Reentrant.
 // Returns 0, or -1 for a state outside sim_scene_smooth()'s.
 int sim_image_render(const struct sim_image *image, double azimuth_deg, double elevation_deg,
                      double pupil_mm, double lid_opening, int terms, double *radiance);

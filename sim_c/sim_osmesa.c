@@ -161,6 +161,7 @@ static int start(struct sim_osmesa *o, char *error, size_t bytes) {
     gl->Viewport(0, 0, n, n);
     if (!good || gl->CheckFramebufferStatus(GL_FRAMEBUFFER) != GL_FRAMEBUFFER_COMPLETE || gl->GetError())
         return fail(error, bytes, "OpenGL gives no framebuffer of 32-bit floats of this size");
+    gl->make_current(NULL, NULL, 0, 0, 0);
     return 0;
 }
 
@@ -263,5 +264,7 @@ int sim_osmesa_render(struct sim_osmesa *o, double azimuth_deg, double elevation
         gl->ReadPixels(0, 0, (int)n, (int)n, GL_RGBA, GL_FLOAT, radiance + (size_t)e * n * n * 4);
     }
     for (size_t i = 0; i < (size_t)o->n_emitters * n * n * 4; ++i) radiance[i] /= GAIN;
-    return gl->GetError() ? -2 : 0;
+    unsigned error = gl->GetError();
+    gl->make_current(NULL, NULL, 0, 0, 0);  // another thread may be next
+    return error ? -2 : 0;
 }

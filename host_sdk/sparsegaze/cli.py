@@ -22,6 +22,7 @@ COMMANDS = {
     "doctor": ("cli_device", "What is installed, what is missing and how to get it."),
     "list": ("cli_device", "Ports and devices, virtual ones too."),
     "map": ("cli_map", "What each sensor receives over gaze, on a simulated person."),
+    "view": ("cli_view", "What one sensor sees of a simulated eye, as a picture."),
     "virtual": ("cli_device", "Run a virtual Nano: prints its port, runs until stopped."),
     "flash": ("cli_device", "Put the firmware on a board and read it back."),
     "info": ("cli_device", "Versions, limits, counters, exposures and stored models."),

@@ -163,23 +163,20 @@ class _EmbreeCamera:
     def render(self, azimuth_deg, elevation_deg, pupil_mm, lid_opening, parts=PARTS):
         """[emitter, row, column] radiance of the sum of the named parts."""
         out = np.empty(self._shape)
-        bad = self._lib.sim_image_render(
-            self._image,
-            azimuth_deg,
-            elevation_deg,
-            pupil_mm,
-            lid_opening,
-            sum(PARTS[name] for name in parts),
-            self._ffi.from_buffer("double[]", out),
-        )
-        if bad:
-            raise bad_state(azimuth_deg, elevation_deg, pupil_mm, lid_opening)
+        terms = sum(PARTS[name] for name in parts)
+        self._render((azimuth_deg, elevation_deg, pupil_mm, lid_opening), terms, out)
         return out
 
     def render_parts(self, azimuth_deg, elevation_deg, pupil_mm, lid_opening):
         """{part: [emitter, row, column]}"""
-        state = azimuth_deg, elevation_deg, pupil_mm, lid_opening
-        return {name: self.render(*state, parts=(name,)) for name in PARTS}
+        out = np.empty((len(PARTS),) + self._shape)
+        terms = sum(PARTS.values()) + self._lib.SIM_IMAGE_APART
+        self._render((azimuth_deg, elevation_deg, pupil_mm, lid_opening), terms, out)
+        return dict(zip(PARTS, out))
+
+    def _render(self, state, terms, out):
+        if self._lib.sim_image_render(self._image, *state, terms, self._ffi.from_buffer("double[]", out)):
+            raise bad_state(*state)
 
 
 def bad_state(azimuth_deg, elevation_deg, pupil_mm, lid_opening):
@@ -216,11 +213,47 @@ class View:
     pupil_mm: float
     lid_opening: float
     renderer: str
+    half_width_sigmas: float
     radiance: np.ndarray
     parts: dict
     window: np.ndarray
     solid_angle: np.ndarray
     edges: np.ndarray
+
+    @property
+    def sigma_tan(self):
+        """Standard deviation of the window, in tangents."""
+        return float(self.edges[-1] / self.half_width_sigmas)
+
+    def glints(self):
+        """[(emitter, (x, y) tangents)] of the glints that outshine what is around them."""
+        found, middle = [], (self.edges[1:] + self.edges[:-1]) / 2
+        rest = sum(image for name, image in self.parts.items() if name != "glint").sum(0)
+        for number, glint in zip(self.emitters, self.parts["glint"]):
+            row, column = np.unravel_index(np.argmax(glint), glint.shape)
+            if glint[row, column] > 0.5 * rest[row, column] + 0.05 * rest.max():
+                found.append((number, (float(middle[column]), float(-middle[row]))))
+        return found
+
+    def save(self, path):
+        """Write everything to a file that numpy.load() reads (the name is taken as it is)."""
+        with open(path, "wb") as file:
+            np.savez_compressed(
+                file,
+                radiance=self.radiance,
+                **{"part_" + name: image for name, image in self.parts.items()},
+                window=self.window,
+                solid_angle=self.solid_angle,
+                edges_tan=self.edges,
+                sensor=self.sensor,
+                emitters=np.array(self.emitters),
+                azimuth_deg=self.azimuth_deg,
+                elevation_deg=self.elevation_deg,
+                pupil_mm=self.pupil_mm,
+                lid_opening=self.lid_opening,
+                renderer=self.renderer,
+                units="radiance per unit axial intensity, 1/mm^2; solid_angle sr; edges_tan tangents",
+            )
 
     def sums(self):
         """{part: [emitter] its response, 1/mm^2, and total}"""
@@ -242,15 +275,24 @@ def view(
     half_width_sigmas=3.0,
     renderer="embree",
     slip_mm=(0.0, 0.0, 0.0),
+    samples=1,
 ):
-    """The View of one sensor at one state. emitters: numbers of those that are lit; default all but the one
-    at the sensor's own place (or that one, when it is the only one).
+    """The View of one sensor at one state.
+
+    emitters    numbers of those that are lit; default all but the one at the sensor's own place (or that
+                one, when it is the only one)
+    samples     a pixel is the mean of samples x samples points in it; pixels * samples <= 4096
     """
-    method = ImageMethod(headset, person, slip_mm, pixels, half_width_sigmas, renderer)
+    if samples < 1 or pixels * samples > 4096:
+        raise SceneError("%d pixels of %d x %d samples" % (pixels, samples, samples), "at most 4096 in a row")
+    method = ImageMethod(headset, person, slip_mm, pixels * samples, half_width_sigmas, renderer)
     if emitters is None:
         emitters = _others(headset, sensor)
     camera = method.camera(sensor, emitters)
     parts = camera.render_parts(azimuth_deg, elevation_deg, pupil_mm, lid_opening)
+    blocks = (len(emitters), pixels, samples, pixels, samples)
+    parts = {name: image.reshape(blocks).mean((2, 4)) for name, image in parts.items()}
+    weights = camera_weights(headset.sensors[sensor].sigma_deg, pixels, half_width_sigmas)
     return View(
         int(sensor),
         tuple(int(e) for e in emitters),
@@ -259,11 +301,10 @@ def view(
         float(pupil_mm),
         float(lid_opening),
         renderer,
+        float(half_width_sigmas),
         sum(parts.values()),
         parts,
-        camera.window,
-        camera.solid_angle,
-        camera.edges,
+        *weights,
     )
 
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The images of image.py by Mesa's software OpenGL, in 32-bit floats: sim_c/sim_osmesa.h."""
 
+import threading
+
 import numpy as np
 
 from .errors import SceneError
@@ -8,22 +10,26 @@ from .image import PARTS, bad_state, camera_weights
 from .scene import simulator
 
 
+_DRAWING = threading.Lock()
+
+
 class OsmesaCamera:
-    """One sensor's images. Not for several threads at once. SceneError when libOSMesa is missing."""
+    """One sensor's images; threads take turns. SceneError when libOSMesa is missing."""
 
     def __init__(self, method, sensor, emitters):
         ffi, lib = simulator()
         error = ffi.new("char[200]")
-        made = lib.sim_osmesa_open(
-            method.scene._scene,
-            sensor,
-            list(emitters),
-            len(emitters),
-            method.pixels,
-            method.half_width_sigmas,
-            error,
-            200,
-        )
+        with _DRAWING:
+            made = lib.sim_osmesa_open(
+                method.scene._scene,
+                sensor,
+                list(emitters),
+                len(emitters),
+                method.pixels,
+                method.half_width_sigmas,
+                error,
+                200,
+            )
         if made == ffi.NULL:
             raise SceneError(ffi.string(error).decode(), "apt-get install libosmesa6, or renderer embree")
         self._ffi, self._lib, self._scene = ffi, lib, method.scene
@@ -36,16 +42,11 @@ class OsmesaCamera:
     def render_parts(self, azimuth_deg, elevation_deg, pupil_mm, lid_opening):
         """{part: [emitter, row, column] float32}"""
         out = np.empty(self._shape, np.float32)
-        bad = self._lib.sim_osmesa_render(
-            self._osmesa,
-            azimuth_deg,
-            elevation_deg,
-            pupil_mm,
-            lid_opening,
-            self._ffi.from_buffer("float[]", out),
-        )
+        state = azimuth_deg, elevation_deg, pupil_mm, lid_opening
+        with _DRAWING:
+            bad = self._lib.sim_osmesa_render(self._osmesa, *state, self._ffi.from_buffer("float[]", out))
         if bad == -1:
-            raise bad_state(azimuth_deg, elevation_deg, pupil_mm, lid_opening)
+            raise bad_state(*state)
         if bad:
             raise SceneError("OpenGL failed while drawing", "fewer pixels, or renderer embree")
         return {name: out[..., k] for k, name in enumerate(PARTS)}
