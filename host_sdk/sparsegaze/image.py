@@ -19,7 +19,8 @@ from .scene import Scene, simulator
 PARTS = {"face": 1, "sclera": 2, "iris": 4, "glint": 8}
 OCCLUSION = {"soft": 0, "rays": 1}
 RENDERERS = ("embree", "osmesa")
-MIDDLE_GREY = 0.18
+# Of an automatic exposure: this part of the pixels that are not black lies below that part of full scale.
+EXPOSED_PIXELS, EXPOSED_LEVEL = 0.99, 0.8
 
 
 class ImageMethod:
@@ -104,17 +105,19 @@ class ImageMethod:
 def expose(image, bits="float", clip=False):
     """An image as it is left by a camera of so many bits, in its own unit again.
 
-    Full scale is the brightest pixel, so that nothing is clipped, or with clip=True 1 / 0.18 of the mean of
-    the pixels that are not black: the usual automatic exposure, which puts the mean at middle grey (18 %)
-    and lets what is more than 5.6 times as bright saturate. Levels are linear: 0 .. 2^bits - 1, rounded to
-    the nearest.
+    Full scale is the brightest pixel, so that nothing is clipped; or with clip=True the usual automatic
+    exposure, which looks after most of the picture: 99 % of the pixels that are not black lie below 80 % of
+    full scale, and what is brighter than full scale (glints) saturates. Levels are linear, 0 .. 2^bits - 1,
+    rounded to the nearest.
     """
     if bits not in ("float", 8, 16):
         raise SceneError("bits = %r" % (bits,), "float, 16 or 8")
     lit = image[image > 0]
     if lit.size == 0:
         return image
-    full = float(lit.mean(dtype=float)) / MIDDLE_GREY if clip else float(lit.max())
+    full = float(lit.max())
+    if clip:
+        full = min(full, float(np.quantile(lit, EXPOSED_PIXELS)) / EXPOSED_LEVEL)
     seen = np.minimum(image, full)
     if bits == "float":
         return seen
