@@ -190,6 +190,7 @@ void sim_scene_close(struct sim_scene *scene) {
     free(scene->face_all);
     free(scene->face_spots);
     free(scene->lid_spots);
+    free(scene->lid_columns);
     free(scene);
 }
 
