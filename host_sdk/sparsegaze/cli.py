@@ -23,6 +23,7 @@ COMMANDS = {
     "list": ("cli_device", "Ports and devices, virtual ones too."),
     "map": ("cli_map", "What each sensor receives over gaze, on a simulated person."),
     "view": ("cli_view", "What one sensor sees of a simulated eye, as a picture."),
+    "study": ("cli_study", "Maps of many placements on many people, resumable."),
     "virtual": ("cli_device", "Run a virtual Nano: prints its port, runs until stopped."),
     "flash": ("cli_device", "Put the firmware on a board and read it back."),
     "info": ("cli_device", "Versions, limits, counters, exposures and stored models."),
