@@ -8,20 +8,33 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { N_AXES = 10, HEADER_BYTES = 80, N_SMALL = 6 };
-enum { AX_PUPIL, AX_LID, AX_SLIP, AX_EL = 5, AX_AZ, AX_GLINT_LID, AX_GLINT_EL, AX_GLINT_AZ };
-#define MAX_VALUES (UINT64_C(1) << 27)
+enum { N_AXES = 7, HEADER_BYTES = 72, HEAD_BYTES = 40, MAX_PAIRS = SIM_MAP_MAX_SENSORS * SIM_MAP_MAX_EMITTERS };
+enum { MAX_ROWS = 4 * 4 * 4 * 4 * 4 * 4 };  // four taps along all axes but azimuth
+enum { AX_SLIP, AX_PUPIL = 3, AX_LID, AX_EL, AX_AZ };
+#ifdef __GNUC__
+#define PREFETCH(p) __builtin_prefetch(p)
+#else
+#define PREFETCH(p) ((void)(p))
+#endif
+#define MAX_VALUES (UINT64_C(1) << 28)
 
-static const unsigned char MAGIC[8] = {'S', 'G', 'M', 'A', 'P', '\r', '\n', 1};
+static const unsigned char MAGIC[8] = {'S', 'G', 'M', 'A', 'P', '\r', '\n', 2};
+
+struct table {
+    int kind, bytes;
+    struct spline_axis axis[N_AXES];
+    size_t stride[N_AXES];          // in values
+    const double *offset, *scale;   // per pair; NULL for 4-byte values
+    const void *values;             // float or uint16_t
+};
 
 struct sim_map {
-    int sensors, emitters, pairs;
-    int n[N_AXES];
-    double *axis[N_AXES];
-    double *curve[N_AXES];  // of the small axes: see sim_map_spline.h
+    int sensors, emitters, pairs, n_tables;
     double mean;
-    int smooth_gaze[2], glint_gaze[2];  // coefficients per gaze axis: n + 2 for splines, 1 for constants
-    float *smooth, *glint;  // B-spline coefficients along gaze, node values along the other axes
+    struct sim_map_error error;
+    struct table table[SIM_MAP_MAX_TABLES];
+    double *knots;        // of all axes
+    unsigned char *file;  // nodes, offsets, scales and coefficients live in here
 };
 
 static int fail(char *error, size_t bytes, const char *why) {
@@ -42,141 +55,154 @@ static double get_f64(const unsigned char *p) {
     return v;
 }
 
-static float get_f32(const unsigned char *p) {
-    uint32_t bits = (uint32_t)get_le(p, 4);
-    float v;
-    memcpy(&v, &bits, sizeof v);
-    return v;
-}
-
+// Eight bytes at a step: the table of byte k says what a byte does that k more bytes follow.
 static uint32_t crc32_of(const unsigned char *p, size_t n) {
-    uint32_t table[256], crc = 0xFFFFFFFFu;
+    static const int SLICES = 8;
+    uint32_t table[8][256], crc = 0xFFFFFFFFu;
     for (uint32_t i = 0; i < 256; ++i) {
         uint32_t c = i;
         for (int k = 0; k < 8; ++k) c = c & 1 ? 0xEDB88320u ^ c >> 1 : c >> 1;
-        table[i] = c;
+        table[0][i] = c;
     }
-    for (size_t i = 0; i < n; ++i) crc = table[(crc ^ p[i]) & 0xFF] ^ crc >> 8;
+    for (int k = 1; k < SLICES; ++k)
+        for (int i = 0; i < 256; ++i)
+            table[k][i] = table[0][table[k - 1][i] & 0xFF] ^ table[k - 1][i] >> 8;
+    for (; n >= 8; n -= 8, p += 8) {
+        crc ^= (uint32_t)get_le(p, 4);
+        crc = table[7][crc & 0xFF] ^ table[6][crc >> 8 & 0xFF] ^ table[5][crc >> 16 & 0xFF] ^
+              table[4][crc >> 24] ^ table[3][p[4]] ^ table[2][p[5]] ^ table[1][p[6]] ^ table[0][p[7]];
+    }
+    for (; n; --n, ++p) crc = table[0][(crc ^ *p) & 0xFF] ^ crc >> 8;
     return ~crc;
 }
 
-// Values [blocks][n_el][n_az][pairs], little-endian in the file, to spline coefficients
-// [blocks][m_el][m_az][pairs].
-static int fit_gaze(const unsigned char *file, uint64_t blocks, int n_el, int n_az, int pairs, int m_el,
-                    int m_az, float *out) {
-    int longest = n_el > n_az ? n_el : n_az;
-    double *line = malloc((size_t)(3 * longest + 4) * sizeof *line);
-    if (!line) return -1;
-    double *coef = line + longest, *work = coef + longest + 2;
-    int ok = 1;
-    for (uint64_t b = 0; b < blocks && ok; ++b) {
-        float *dst = out + b * (uint64_t)m_el * (uint64_t)m_az * (uint64_t)pairs;
-        for (int e = 0; e < n_el; ++e)
-            for (int p = 0; p < pairs; ++p) {
-                for (int a = 0; a < n_az; ++a) {
-                    uint64_t at = ((b * (uint64_t)n_el + (uint64_t)e) * (uint64_t)n_az + (uint64_t)a) *
-                                      (uint64_t)pairs +
-                                  (uint64_t)p;
-                    float v = get_f32(file + 4 * at);
-                    ok &= isfinite(v) && fabsf(v) < 1e30f;
-                    line[a] = v;
-                }
-                if (n_az == 1) coef[0] = line[0];
-                else bspline_fit(line, n_az, coef, work);
-                for (int a = 0; a < m_az; ++a) dst[(e * m_az + a) * pairs + p] = (float)coef[a];
-            }
-        if (n_el == 1) continue;
-        for (int a = 0; a < m_az; ++a)
-            for (int p = 0; p < pairs; ++p) {
-                for (int e = 0; e < n_el; ++e) line[e] = dst[(e * m_az + a) * pairs + p];
-                bspline_fit(line, n_el, coef, work);
-                for (int e = 0; e < m_el; ++e) dst[(e * m_az + a) * pairs + p] = (float)coef[e];
-            }
+// Bring n numbers to this machine's byte order, in place. Returns them, or NULL when one is not finite.
+static const double *doubles_here(unsigned char *p, size_t n) {
+    double *out = (double *)(void *)p;
+    for (size_t i = 0; i < n; ++i) {
+        out[i] = get_f64(p + 8 * i);
+        if (!isfinite(out[i])) return NULL;
     }
-    free(line);
+    return out;
+}
+
+static int values_here(unsigned char *p, size_t n, int bytes) {
+    if (bytes == 2) {
+        uint16_t *out = (uint16_t *)(void *)p;
+        for (size_t i = 0; i < n; ++i) out[i] = (uint16_t)(p[2 * i] | p[2 * i + 1] << 8);
+        return 0;
+    }
+    float *out = (float *)(void *)p;
+    int ok = 1;
+    for (size_t i = 0; i < n; ++i) {
+        uint32_t bits =
+            p[4 * i] | (uint32_t)p[4 * i + 1] << 8 | (uint32_t)p[4 * i + 2] << 16 | (uint32_t)p[4 * i + 3] << 24;
+        memcpy(&out[i], &bits, sizeof bits);
+        ok &= fabsf(out[i]) < 1e30f;
+    }
     return ok ? 0 : -1;
 }
 
-static int read_axes(struct sim_map *map, const unsigned char *p, char *error, size_t bytes) {
+static int read_table(struct sim_map *map, struct table *t, unsigned char **at, double **knots, char *error,
+                      size_t bytes) {
+    size_t pairs = (size_t)map->pairs, values = pairs;
+    for (int k = N_AXES - 1; k >= 0; --k) {
+        t->stride[k] = values;
+        values *= (size_t)t->axis[k].n;
+    }
     for (int k = 0; k < N_AXES; ++k) {
-        int n = map->n[k], is_gaze = k == AX_EL || k == AX_AZ || k >= AX_GLINT_EL;
-        double *x = map->axis[k] = malloc((size_t)n * sizeof *x);
-        if (!x) return fail(error, bytes, "out of memory");
-        for (int i = 0; i < n; ++i, p += 8) {
-            x[i] = get_f64(p);
-            if (!isfinite(x[i]) || fabs(x[i]) > 1e6)
-                return fail(error, bytes, "an axis holds a number that is not finite");
+        int n = t->axis[k].n;
+        const double *x = doubles_here(*at, (size_t)n);
+        if (!x) return fail(error, bytes, "an axis holds a number that is not finite");
+        for (int i = 0; i < n; ++i) {
+            if (fabs(x[i]) > 1e6) return fail(error, bytes, "an axis holds an absurd number");
             if (i && x[i] - x[i - 1] < 1e-6) return fail(error, bytes, "an axis is not increasing");
         }
-        if (is_gaze) {
-            for (int i = 1; i < n; ++i) {
-                double step = (x[n - 1] - x[0]) / (n - 1);
-                if (fabs(x[i] - x[i - 1] - step) > 1e-6 * step)
-                    return fail(error, bytes, "a gaze axis is not uniform");
-            }
-            continue;
-        }
-        map->curve[k] = malloc((size_t)(n * n) * sizeof(double));
-        if (!map->curve[k]) return fail(error, bytes, "out of memory");
-        if (cardinal_curvature(x, n, map->curve[k]))
-            return fail(error, bytes, "an axis cannot be interpolated");
+        t->axis[k].nodes = (double *)(void *)*at;
+        t->axis[k].knots = *knots;
+        spline_knots(&t->axis[k]);
+        *knots += n + 4;
+        *at += 8 * (size_t)n;
     }
+    if (t->bytes == 2) {
+        const double *range = doubles_here(*at, 2 * pairs);
+        for (size_t i = 0; range && i < 2 * pairs; ++i)
+            if (fabs(range[i]) > 1e30 || (i >= pairs && range[i] < 0)) range = NULL;
+        if (!range) return fail(error, bytes, "a scale of responses is not finite");
+        t->offset = range;
+        t->scale = range + pairs;
+        *at += 16 * pairs;
+    }
+    if (values_here(*at, values, t->bytes)) return fail(error, bytes, "a response is not finite");
+    t->values = *at;
+    *at += (values * (size_t)t->bytes + 7) / 8 * 8;
     return 0;
 }
 
-static int parse(struct sim_map *map, const unsigned char *file, size_t size, char *error, size_t bytes) {
+// Sizes of one table: its bytes in the file after its head, its axes' nodes; 0 when they are absurd.
+static uint64_t table_bytes(const unsigned char *head, struct table *t, uint64_t pairs, uint64_t *nodes,
+                            uint64_t *all_values) {
+    uint64_t kind = get_le(head, 4), width = get_le(head + 4, 4), values = pairs;
+    *nodes = 0;
+    if (kind > SIM_MAP_GLINT || (width != 2 && width != 4)) return 0;
+    for (int k = 0; k < N_AXES; ++k) {
+        uint64_t n = get_le(head + 8 + 4 * k, 4);
+        if (n < 1 || n > (k >= AX_EL ? SIM_MAP_MAX_GAZE_NODES : SIM_MAP_MAX_STATE_NODES)) return 0;
+        t->axis[k].n = (int)n;
+        *nodes += n;
+        values *= n;  // at most 2^28 * 2^10 before it is compared
+        if (values > MAX_VALUES) return 0;
+    }
+    *all_values += values;
+    t->kind = (int)kind;
+    t->bytes = (int)width;
+    return 8 * *nodes + (width == 2 ? 16 * pairs : 0) + (values * width + 7) / 8 * 8;
+}
+
+static int parse(struct sim_map *map, size_t size, char *error, size_t bytes) {
+    unsigned char *file = map->file;
     if (size < HEADER_BYTES) return fail(error, bytes, "not a response map: too short");
     if (memcmp(file, MAGIC, sizeof MAGIC)) return fail(error, bytes, "not a response map of this version");
     if (get_le(file + 8, 8) != size)
         return fail(error, bytes, "truncated or extended: the length is not the one in the header");
-    uint64_t sensors = get_le(file + 20, 4), emitters = get_le(file + 24, 4), n[N_AXES];
+    uint64_t sensors = get_le(file + 20, 4), emitters = get_le(file + 24, 4), tables = get_le(file + 28, 4);
     if (sensors < 1 || sensors > SIM_MAP_MAX_SENSORS || emitters < 1 || emitters > SIM_MAP_MAX_EMITTERS)
         return fail(error, bytes, "number of sensors or emitters out of range");
-    uint64_t axis_nodes = 0;
-    for (int k = 0; k < N_AXES; ++k) {
-        int is_gaze = k == AX_EL || k == AX_AZ || k >= AX_GLINT_EL;
-        n[k] = get_le(file + 28 + 4 * k, 4);
-        uint64_t most = is_gaze ? SIM_MAP_MAX_GAZE_NODES : SIM_MAP_MAX_STATE_NODES;
-        if (n[k] < 1 || n[k] > most || (is_gaze && n[k] > 1 && n[k] < 4))
-            return fail(error, bytes, "number of nodes out of range");
-        axis_nodes += n[k];
-        map->n[k] = (int)n[k];
+    if (tables < 1 || tables > SIM_MAP_MAX_TABLES)
+        return fail(error, bytes, "number of tables out of range");
+    uint64_t length = HEADER_BYTES + HEAD_BYTES * tables, all_nodes = 0, all_values = 0;
+    if (size < length) return fail(error, bytes, "not a response map: too short");
+    for (uint64_t i = 0; i < tables; ++i) {
+        const unsigned char *head = file + HEADER_BYTES + HEAD_BYTES * i;
+        uint64_t nodes, more = table_bytes(head, &map->table[i], sensors * emitters, &nodes, &all_values);
+        if (!more) return fail(error, bytes, "a table is of unknown kind or too large");
+        if (get_le(head + 36, 4)) return fail(error, bytes, "reserved field is not zero");
+        length += more;
+        all_nodes += nodes;
     }
-    if (get_le(file + 28 + 4 * N_AXES, 4)) return fail(error, bytes, "reserved field is not zero");
-    // Every factor is below 2^10, so no product of these below wraps before it is compared.
-    uint64_t pairs = sensors * emitters, slips = n[2] * n[3] * n[4];
-    uint64_t smooth_blocks = slips * n[AX_PUPIL] * n[AX_LID], glint_blocks = slips * n[AX_GLINT_LID];
-    uint64_t smooth = smooth_blocks * n[AX_EL] * n[AX_AZ],
-             glint = glint_blocks * n[AX_GLINT_EL] * n[AX_GLINT_AZ];
-    if (smooth > MAX_VALUES || glint > MAX_VALUES || (smooth + glint) * pairs > MAX_VALUES)
-        return fail(error, bytes, "too large");
-    if (size != HEADER_BYTES + 8 * axis_nodes + 4 * pairs * (smooth + glint))
-        return fail(error, bytes, "the length does not fit the number of nodes");
+    if (all_values > MAX_VALUES) return fail(error, bytes, "too large");
+    if (size != length) return fail(error, bytes, "the length does not fit the number of nodes");
     if (get_le(file + 16, 4) != crc32_of(file + 20, size - 20))
         return fail(error, bytes, "damaged: checksum mismatch");
     map->sensors = (int)sensors;
     map->emitters = (int)emitters;
-    map->pairs = (int)pairs;
-    map->mean = get_f64(file + 72);
+    map->pairs = (int)(sensors * emitters);
+    map->n_tables = (int)tables;
+    map->mean = get_f64(file + 32);
     if (!isfinite(map->mean) || map->mean <= 0)
         return fail(error, bytes, "the mean response is not positive");
-    const unsigned char *p = file + HEADER_BYTES;
-    if (read_axes(map, p, error, bytes)) return -1;
-    p += 8 * axis_nodes;
-    for (int g = 0; g < 2; ++g) {
-        map->smooth_gaze[g] = map->n[AX_EL + g] == 1 ? 1 : map->n[AX_EL + g] + 2;
-        map->glint_gaze[g] = map->n[AX_GLINT_EL + g] == 1 ? 1 : map->n[AX_GLINT_EL + g] + 2;
+    double stated[4];
+    for (int k = 0; k < 4; ++k) {
+        stated[k] = get_f64(file + 40 + 8 * k);
+        if (!(stated[k] == -1 || (stated[k] >= 0 && stated[k] < 1e30)))
+            return fail(error, bytes, "a stated error is not a possible one");
     }
-    map->smooth = malloc(smooth_blocks * (uint64_t)map->smooth_gaze[0] * (uint64_t)map->smooth_gaze[1] *
-                         pairs * sizeof(float));
-    map->glint = malloc(glint_blocks * (uint64_t)map->glint_gaze[0] * (uint64_t)map->glint_gaze[1] * pairs *
-                        sizeof(float));
-    if (!map->smooth || !map->glint) return fail(error, bytes, "out of memory");
-    if (fit_gaze(p, smooth_blocks, map->n[AX_EL], map->n[AX_AZ], map->pairs, map->smooth_gaze[0],
-                 map->smooth_gaze[1], map->smooth) ||
-        fit_gaze(p + 4 * pairs * smooth, glint_blocks, map->n[AX_GLINT_EL], map->n[AX_GLINT_AZ], map->pairs,
-                 map->glint_gaze[0], map->glint_gaze[1], map->glint))
-        return fail(error, bytes, "a response is not finite");
+    map->error = (struct sim_map_error){stated[0], stated[1], stated[2], stated[3]};
+    double *knots = map->knots = malloc((size_t)(all_nodes + 4 * N_AXES * tables) * sizeof *knots);
+    if (!knots) return fail(error, bytes, "out of memory");
+    unsigned char *at = file + HEADER_BYTES + HEAD_BYTES * tables;
+    for (uint64_t i = 0; i < tables; ++i)
+        if (read_table(map, &map->table[i], &at, &knots, error, bytes)) return -1;
     return 0;
 }
 
@@ -207,23 +233,21 @@ struct sim_map *sim_map_open(const char *path, char *error, size_t error_bytes) 
     unsigned char *file = read_whole(path, &size, error, error_bytes);
     if (!file) return NULL;
     struct sim_map *map = calloc(1, sizeof *map);
-    if (!map) fail(error, error_bytes, "out of memory");
-    else if (parse(map, file, size, error, error_bytes)) {
-        sim_map_close(map);
-        map = NULL;
+    if (!map) {
+        free(file);
+        fail(error, error_bytes, "out of memory");
+        return NULL;
     }
-    free(file);
-    return map;
+    map->file = file;
+    if (!parse(map, size, error, error_bytes)) return map;
+    sim_map_close(map);
+    return NULL;
 }
 
 void sim_map_close(struct sim_map *map) {
     if (!map) return;
-    for (int k = 0; k < N_AXES; ++k) {
-        free(map->axis[k]);
-        free(map->curve[k]);
-    }
-    free(map->smooth);
-    free(map->glint);
+    free(map->knots);
+    free(map->file);
     free(map);
 }
 
@@ -236,76 +260,172 @@ int sim_map_emitters(const struct sim_map *map) {
 double sim_map_mean(const struct sim_map *map) {
     return map->mean;
 }
-
-int sim_map_axis(const struct sim_map *map, int axis, const double **nodes) {
-    if (axis < 0 || axis >= N_AXES) return 0;
-    if (nodes) *nodes = map->axis[axis];
-    return map->n[axis];
+struct sim_map_error sim_map_error(const struct sim_map *map) {
+    return map->error;
 }
 
-// Add weight times the spline surface of one block at one gaze.
-static void add_block(const float *block, int m_az, int pairs, const int first[2], const int count[2],
-                      double w_el[4], double w_az[4], double weight, double *out) {
-    for (int e = 0; e < count[0]; ++e)
-        for (int a = 0; a < count[1]; ++a) {
-            const float *c =
-                block + ((size_t)(first[0] + e) * (size_t)m_az + (size_t)(first[1] + a)) * (size_t)pairs;
-            double w = weight * w_el[e] * w_az[a];
-            for (int p = 0; p < pairs; ++p) out[p] += w * c[p];
+int sim_map_kind(const struct sim_map *map, int table) {
+    return table < 0 || table >= map->n_tables ? -1 : map->table[table].kind;
+}
+
+int sim_map_axis(const struct sim_map *map, int table, int axis, const double **nodes) {
+    if (table < 0 || table >= map->n_tables || axis < 0 || axis >= N_AXES) return 0;
+    if (nodes) *nodes = map->table[table].axis[axis].nodes;
+    return map->table[table].axis[axis].n;
+}
+
+// Weighted sum of the coefficients of up to four neighbours in azimuth, for every pair. In single precision:
+// 1e-7 of the response.
+#define DEFINE_ROW(name, type)                                                                            \
+    static void name(const type *c, int taps, size_t pairs, const double *weight, float *restrict out) {  \
+        float w0 = (float)weight[0];                                                                      \
+        if (taps == 4) {                                                                                  \
+            float w1 = (float)weight[1], w2 = (float)weight[2], w3 = (float)weight[3];                    \
+            const type *c1 = c + pairs, *c2 = c1 + pairs, *c3 = c2 + pairs;                               \
+            for (size_t p = 0; p < pairs; ++p)                                                            \
+                out[p] = w0 * (float)c[p] + w1 * (float)c1[p] + w2 * (float)c2[p] + w3 * (float)c3[p];    \
+            return;                                                                                       \
+        }                                                                                                 \
+        for (size_t p = 0; p < pairs; ++p) out[p] = w0 * (float)c[p];                                     \
+        for (int a = 1; a < taps; ++a)                                                                    \
+            for (size_t p = 0; p < pairs; ++p) out[p] += (float)weight[a] * (float)c[(size_t)a * pairs + p]; \
+    }
+DEFINE_ROW(row_f32, float)
+DEFINE_ROW(row_u16, uint16_t)
+
+static void row(const struct table *t, size_t at, const struct spline_place *place, const double *weight,
+                size_t pairs, float *out) {
+    if (t->bytes == 2) row_u16((const uint16_t *)t->values + at, place->taps, pairs, weight, out);
+    else row_f32((const float *)t->values + at, place->taps, pairs, weight, out);
+}
+
+static void add(double *restrict out, double weight, const float *restrict row, size_t pairs) {
+    if (weight == 0) return;
+    for (size_t p = 0; p < pairs; ++p) out[p] += weight * (double)row[p];
+}
+
+// Rows of up to four neighbours in azimuth about a place: where each begins, its taps along the other axes and
+// the product of their weights.
+struct rows {
+    int n, tap[MAX_ROWS][AX_AZ];
+    size_t at[MAX_ROWS];
+    double weight[MAX_ROWS];
+};
+
+// The tables are larger than any cache and a state's rows lie far apart: all are asked for before the first is
+// used, which halves the time of a state that was not looked at lately.
+static void find_rows(const struct table *t, const struct spline_place place[N_AXES], size_t pairs, int all,
+                      struct rows *rows) {
+    rows->n = 1;
+    rows->at[0] = (size_t)place[AX_AZ].first * pairs;
+    rows->weight[0] = 1;
+    for (int k = 0; k < AX_AZ; ++k) {
+        const struct spline_place *p = &place[k];
+        int before = rows->n, n = before;
+        for (int tap = p->taps - 1; tap >= 0; --tap) {
+            if (p->weight[tap] == 0 && !all && tap) continue;
+            // The first tap overwrites what it is made from: last.
+            int to = tap ? n : 0;
+            for (int r = 0; r < before; ++r) {
+                rows->at[to + r] = rows->at[r] + (size_t)(p->first + tap) * t->stride[k];
+                rows->weight[to + r] = rows->weight[r] * p->weight[tap];
+                if (to) memcpy(rows->tap[to + r], rows->tap[r], sizeof *rows->tap);
+                rows->tap[to + r][k] = tap;
+            }
+            if (tap) n += before;
         }
+        rows->n = n;
+    }
+    size_t line = 64 / (size_t)t->bytes, row = (size_t)place[AX_AZ].taps * pairs;
+    if (rows->n == 1 || row > 16 * line) return;
+    for (int r = 0; r < rows->n; ++r)
+        for (size_t i = 0; i < row; i += line)
+            PREFETCH((const char *)t->values + (rows->at[r] + i) * (size_t)t->bytes);
+}
+
+// Add one table at one place. gradient, [N_AXES][pairs] by the table's axes, may be NULL.
+static void add_table(const struct table *t, const double v[N_AXES], size_t pairs, double *out,
+                      double *gradient) {
+    struct spline_place place[N_AXES];
+    struct rows rows;
+    for (int k = 0; k < N_AXES; ++k) spline_place(&t->axis[k], v[k], &place[k]);
+    find_rows(t, place, pairs, gradient != NULL, &rows);
+    double sum[MAX_PAIRS], slope_sum[N_AXES][MAX_PAIRS];
+    float value[MAX_PAIRS], slope[MAX_PAIRS];
+    memset(sum, 0, pairs * sizeof *sum);
+    for (int k = 0; gradient && k < N_AXES; ++k) memset(slope_sum[k], 0, pairs * sizeof *sum);
+    for (int r = 0; r < rows.n; ++r) {
+        if (rows.weight[r] == 0 && !gradient) continue;
+        const int *tap = rows.tap[r];
+        row(t, rows.at[r], &place[AX_AZ], place[AX_AZ].weight, pairs, value);
+        add(sum, rows.weight[r], value, pairs);
+        if (!gradient) continue;
+        if (place[AX_AZ].taps > 1) {
+            row(t, rows.at[r], &place[AX_AZ], place[AX_AZ].slope, pairs, slope);
+            add(slope_sum[AX_AZ], rows.weight[r], slope, pairs);
+        }
+        for (int k = 0; k < AX_AZ; ++k) {
+            double by = place[k].slope[tap[k]];
+            for (int j = 0; j < AX_AZ && by != 0; ++j)
+                if (j != k) by *= place[j].weight[tap[j]];
+            add(slope_sum[k], by, value, pairs);
+        }
+    }
+    for (size_t p = 0; p < pairs; ++p) out[p] += t->scale ? t->offset[p] + t->scale[p] * sum[p] : sum[p];
+    for (int k = 0; gradient && k < N_AXES; ++k)
+        for (size_t p = 0; p < pairs; ++p)
+            gradient[(size_t)k * pairs + p] += t->scale ? t->scale[p] * slope_sum[k][p] : slope_sum[k][p];
+}
+
+static int place_of(const struct sim_state *s, double v[N_AXES]) {
+    const double values[N_AXES] = {s->slip_mm[0],  s->slip_mm[1],    s->slip_mm[2],  s->pupil_mm,
+                                   s->lid_opening, s->elevation_deg, s->azimuth_deg};
+    for (int k = 0; k < N_AXES; ++k) {
+        if (!isfinite(values[k])) return -1;
+        v[k] = values[k];
+    }
+    return 0;
 }
 
 int sim_map_eval_parts(const struct sim_map *map, const struct sim_state *state, double *smooth,
                        double *glint) {
-    const double v[7] = {state->pupil_mm,   state->lid_opening,   state->slip_mm[0], state->slip_mm[1],
-                         state->slip_mm[2], state->elevation_deg, state->azimuth_deg};
+    double v[N_AXES], *part[2] = {smooth, glint};
     size_t pairs = (size_t)map->pairs;
-    if (smooth) memset(smooth, 0, pairs * sizeof *smooth);
-    if (glint) memset(glint, 0, pairs * sizeof *glint);
-    for (int k = 0; k < 7; ++k)
-        if (!isfinite(v[k])) return -1;
-    double w[N_SMALL][SIM_MAP_MAX_STATE_NODES], w_gaze[4][4];
-    int first[4], count[4];
-    for (int k = 0; k < 5; ++k) small_weights(map->axis[k], map->curve[k], map->n[k], v[k], w[k]);
-    small_weights(map->axis[AX_GLINT_LID], map->curve[AX_GLINT_LID], map->n[AX_GLINT_LID], v[1], w[5]);
-    for (int g = 0; g < 4; ++g) {
-        int axis = g < 2 ? AX_EL + g : AX_GLINT_EL + g - 2;
-        count[g] = gaze_weights(map->axis[axis], map->n[axis], v[5 + g % 2], &first[g], w_gaze[g]);
+    for (int k = 0; k < 2; ++k)
+        if (part[k]) memset(part[k], 0, pairs * sizeof *smooth);
+    if (place_of(state, v)) return -1;
+    for (int i = 0; i < map->n_tables; ++i) {
+        double *out = part[map->table[i].kind == SIM_MAP_GLINT];
+        if (out) add_table(&map->table[i], v, pairs, out, NULL);
     }
-    size_t smooth_block = (size_t)map->smooth_gaze[0] * (size_t)map->smooth_gaze[1] * pairs;
-    size_t glint_block = (size_t)map->glint_gaze[0] * (size_t)map->glint_gaze[1] * pairs, slip = 0;
-    for (int x = 0; x < map->n[2]; ++x)
-        for (int y = 0; y < map->n[3]; ++y)
-            for (int z = 0; z < map->n[4]; ++z, ++slip) {
-                double ws = w[2][x] * w[3][y] * w[4][z];
-                if (ws == 0) continue;
-                for (int i = 0; smooth && i < map->n[AX_PUPIL]; ++i)
-                    for (int j = 0; j < map->n[AX_LID]; ++j) {
-                        double weight = ws * w[0][i] * w[1][j];
-                        size_t at = (slip * (size_t)map->n[AX_PUPIL] + (size_t)i) * (size_t)map->n[AX_LID] +
-                                    (size_t)j;
-                        if (weight != 0)
-                            add_block(map->smooth + at * smooth_block, map->smooth_gaze[1], map->pairs, first,
-                                      count, w_gaze[0], w_gaze[1], weight, smooth);
-                    }
-                for (int j = 0; glint && j < map->n[AX_GLINT_LID]; ++j) {
-                    size_t at = slip * (size_t)map->n[AX_GLINT_LID] + (size_t)j;
-                    if (ws * w[5][j] != 0)
-                        add_block(map->glint + at * glint_block, map->glint_gaze[1], map->pairs, first + 2,
-                                  count + 2, w_gaze[2], w_gaze[3], ws * w[5][j], glint);
-                }
-            }
+    return 0;
+}
+
+int sim_map_eval_gradient(const struct sim_map *map, const struct sim_state *state, double *out,
+                          double *gradient) {
+    static const int ORDER[N_AXES] = {AX_AZ, AX_EL, AX_PUPIL, AX_LID, AX_SLIP, AX_SLIP + 1, AX_SLIP + 2};
+    double v[N_AXES], unused[MAX_PAIRS], by_axis[N_AXES * MAX_PAIRS];
+    size_t pairs = (size_t)map->pairs;
+    double *value = out ? out : unused;
+    memset(value, 0, pairs * sizeof *value);
+    memset(gradient, 0, N_AXES * pairs * sizeof *gradient);
+    if (place_of(state, v)) return -1;
+    memset(by_axis, 0, N_AXES * pairs * sizeof *by_axis);
+    for (int i = 0; i < map->n_tables; ++i) add_table(&map->table[i], v, pairs, value, by_axis);
+    for (int k = 0; k < N_AXES; ++k)
+        memcpy(gradient + (size_t)k * pairs, by_axis + (size_t)ORDER[k] * pairs, pairs * sizeof *gradient);
     return 0;
 }
 
 int sim_map_eval(const struct sim_map *map, const struct sim_state *state, double *out) {
-    double glint[SIM_MAP_MAX_SENSORS * SIM_MAP_MAX_EMITTERS];
-    int bad = sim_map_eval_parts(map, state, out, glint);
-    for (int p = 0; p < map->pairs; ++p) {
-        out[p] = bad ? 0 : out[p] + glint[p];
+    double v[N_AXES];
+    size_t pairs = (size_t)map->pairs;
+    memset(out, 0, pairs * sizeof *out);
+    if (place_of(state, v)) return -1;
+    for (int i = 0; i < map->n_tables; ++i) add_table(&map->table[i], v, pairs, out, NULL);
+    for (size_t p = 0; p < pairs; ++p)
         if (out[p] < 0) out[p] = 0;
-    }
-    return bad;
+    return 0;
 }
 
 int sim_map_eval_many(const struct sim_map *map, const struct sim_state *states, size_t n, double *out) {

@@ -3,27 +3,34 @@
 // Response map of a headset on one person: file reader and smooth interpolator. No dependencies beyond the C
 // library; used by the virtual Nano and, through cffi, by the SDK.
 //
-// The map is response[sensor][emitter] = smooth(pupil, lid, slip, gaze) + glint(lid, slip, gaze), each part
-// tabulated on its own gaze grid because the glint's ring at the limbus is about 3 degrees wide while the
-// rest varies over tens.
+// The map is the sum of a few tables, each over its own nodes of (slip, pupil, lids, gaze): what does not
+// depend on a quantity has one node there (the face sees neither pupil nor azimuth), what varies fast has
+// many (the glint's ring at the limbus is 1 to 3 degrees wide, the rest varies over tens).
 //
 // Units     relative irradiance: what the sensor collects per unit of axial emitter intensity, 1/mm^4 scale;
 //           only ratios mean something. Scale with sim_map_mean().
-// Between   cubic splines with not-a-knot ends (C2) along axes of four or more nodes, the polynomial through
-//           the nodes along shorter ones. Outside the grid the state is clamped. Measured error: simulate.py.
+// Between   tensor-product B-splines through the nodes: cubic, not-a-knot (C2), along axes of four or more
+//           nodes, the polynomial through the nodes along shorter ones. Outside the grid the state is
+//           clamped. The file says how large the error is: sim_map_error().
 //
-// File      little-endian, no padding, float64 axes, float32 values:
-//   0   char   magic[8]        "SGMAP\r\n\x01"
+// File      little-endian; each block below starts at a multiple of 8 bytes (zeros between):
+//   0   char   magic[8]        "SGMAP\r\n\x02"
 //   8   u64    file_bytes      the whole file
 //   16  u32    crc32           IEEE 802.3, of every byte from 20 on
 //   20  u32    sensors         1..32
 //   24  u32    emitters        1..32
-//   28  u32    nodes[11]       pupil, lid, slip x, slip y, slip z, elevation, azimuth of the smooth part;
-//                              lid, elevation, azimuth of the glint part; 0 (reserved)
-//   72  f64    mean            see sim_map_mean(); > 0
-//   80  f64    axes            in that order, strictly increasing; gaze axes uniform, 1 or >= 4 nodes
-//   ..  f32    smooth[slip x][slip y][slip z][pupil][lid][elevation][azimuth][sensor][emitter]
-//   ..  f32    glint [slip x][slip y][slip z][lid][elevation][azimuth][sensor][emitter]
+//   28  u32    tables          1..8
+//   32  f64    mean            see sim_map_mean(); > 0
+//   40  f64    error[4]        struct sim_map_error; each >= 0, or -1: not measured
+//   72  table heads, each 10 u32: kind (enum below), bytes per value (2 or 4), nodes of slip x, slip y,
+//              slip z, pupil, lid, elevation, azimuth, 0 (reserved)
+//   then each table:
+//       f64    nodes of its seven axes in that order, strictly increasing
+//       f64    offset[pairs], scale[pairs] >= 0; of tables of 2-byte values only
+//       f32 or u16  coefficients [slip x][slip y][slip z][pupil][lid][elevation][azimuth][sensor][emitter] of
+//              the B-splines; u16: offset + scale * value
+// An axis of n nodes x[] has n coefficients; its knots are x[0] and x[n-1], each degree + 1 times, and
+// x[2..n-3] between them; degree = min(3, n - 1).
 #ifndef SIM_MAP_H
 #define SIM_MAP_H
 
@@ -33,9 +40,12 @@
 enum {
     SIM_MAP_MAX_SENSORS = 32,
     SIM_MAP_MAX_EMITTERS = 32,
-    SIM_MAP_MAX_STATE_NODES = 32,
+    SIM_MAP_MAX_TABLES = 8,
+    SIM_MAP_MAX_STATE_NODES = 64,
     SIM_MAP_MAX_GAZE_NODES = 513
 };
+
+enum { SIM_MAP_SMOOTH = 0, SIM_MAP_GLINT = 1 };  // kinds of tables
 
 // Where the eye looks and how it is. Angles are Fick azimuth/elevation in degrees, +x right, +y up
 // (OpenXR's frame).
@@ -44,6 +54,13 @@ struct sim_state {
     double pupil_mm;     // diameter of the real pupil
     double lid_opening;  // 0 closed .. 1 as open as these lids are at that gaze
     double slip_mm[3];   // displacement of the headset relative to the head
+};
+
+// Error of a response between the nodes and at them, against direct and finer integration, of all gaze and
+// pupils that the map covers; in the map's unit. -1 = nobody measured it.
+struct sim_map_error {
+    double open_rms, open_max;  // lids open
+    double lids_rms, lids_max;  // lids anywhere between closed and open
 };
 
 struct sim_map;
@@ -59,8 +76,8 @@ int sim_map_sensors(const struct sim_map *map);
 int sim_map_emitters(const struct sim_map *map);
 
 // Response of every pair at one state: out[sensor * emitters + emitter], never negative.
-// Returns 0, or -1 when a state field is not finite (out is then all zero). Reentrant. About 10 microseconds
-// for 36 pairs.
+// Returns 0, or -1 when a state field is not finite (out is then all zero). Reentrant. 1 (lids open) to 4
+// microseconds for 36 pairs when vectorised.
 int sim_map_eval(const struct sim_map *map, const struct sim_state *state, double *out);
 
 // The same for n states in a row: out[n][sensors][emitters]. Returns the number of states that were not
@@ -71,13 +88,25 @@ int sim_map_eval_many(const struct sim_map *map, const struct sim_state *states,
 int sim_map_eval_parts(const struct sim_map *map, const struct sim_state *state, double *smooth,
                        double *glint);
 
-// Mean over gaze within +-20 deg (both axes), over all sensors, of the sum over the other emitters, at
-// pupil 3.5 mm, lids open, no slip: the number that [photocurrent].nominal_na belongs to.
+// The response (not clamped at zero) and its derivatives, of the same splines: gradient[7][sensors][emitters]
+// by azimuth and elevation (per degree), pupil (per mm), lid opening, slip x, y, z (per mm), as in struct
+// sim_state. Where the state is clamped, and along axes of one node, they are 0; on the edge of the map, those
+// from within. out may be NULL. Returns as sim_map_eval(). About three times its cost.
+int sim_map_eval_gradient(const struct sim_map *map, const struct sim_state *state, double *out,
+                          double *gradient);
+
+// Mean over gaze within +-20 deg (an integral over both axes), over all sensors, of the sum over the other
+// emitters, at pupil 3.5 mm, lids open, no slip: the number that [photocurrent].nominal_na belongs to.
 double sim_map_mean(const struct sim_map *map);
 
-// Nodes of one axis, numbered as in the file (0 pupil .. 9 glint azimuth). Returns their count and points
-// *nodes at them (borrowed), or 0 for an unknown axis.
-int sim_map_axis(const struct sim_map *map, int axis, const double **nodes);
+struct sim_map_error sim_map_error(const struct sim_map *map);
+
+// Nodes of one axis of one table, numbered as in the file (0 slip x .. 6 azimuth). Returns their count and
+// points *nodes at them (borrowed), or 0 for an unknown table or axis.
+int sim_map_axis(const struct sim_map *map, int table, int axis, const double **nodes);
+
+// What a table holds (SIM_MAP_SMOOTH, SIM_MAP_GLINT), or -1 when there is no such table.
+int sim_map_kind(const struct sim_map *map, int table);
 // cdef end
 
 #endif

@@ -190,7 +190,6 @@ void sim_scene_close(struct sim_scene *scene) {
     free(scene->face_all);
     free(scene->face_spots);
     free(scene->lid_spots);
-    free(scene->lid_columns);
     free(scene);
 }
 

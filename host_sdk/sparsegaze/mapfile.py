@@ -4,14 +4,97 @@
 import os
 import struct
 import zlib
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
-MAGIC = b"SGMAP\r\n\x01"
+MAGIC = b"SGMAP\r\n\x02"
+AXES = ("slip_x_mm", "slip_y_mm", "slip_z_mm", "pupil_mm", "lid_opening", "elevation_deg", "azimuth_deg")
+SMOOTH, GLINT = 0, 1
+UNMEASURED = (-1.0,) * 4
 
 
-def _axis(values):
-    return np.atleast_1d(np.asarray(values, dtype="<f8"))
+@dataclass(frozen=True)
+class Table:
+    """One table: B-spline coefficients over its seven axes.
+
+    kind           SMOOTH or GLINT
+    axes           nodes of AXES, in order, strictly increasing; one node: does not depend on it
+    coefficients   [slip x, slip y, slip z, pupil, lid, elevation, azimuth, sensor, emitter], float32, or
+                   uint16 with offset and scale [sensor, emitter]
+    """
+
+    kind: int
+    axes: tuple
+    coefficients: np.ndarray
+    offset: np.ndarray = None
+    scale: np.ndarray = None
+
+    def header(self):
+        width = self.coefficients.dtype.itemsize
+        return struct.pack("<10I", self.kind, width, *(len(axis) for axis in self.axes), 0)
+
+    def blocks(self):
+        """Its bytes in the file, in pieces."""
+        yield b"".join(axis.tobytes() for axis in self.axes)
+        if self.offset is not None:
+            yield self.offset.astype("<f8").tobytes() + self.scale.astype("<f8").tobytes()
+        yield self.coefficients.tobytes()
+        yield bytes(-self.coefficients.nbytes % 8)
+
+
+def fit_table(kind, axes, values, bytes_per_value=4):
+    """The Table whose splines go through values at its nodes, [seven axes, sensor, emitter].
+
+    bytes_per_value   4, or 2: rounded to 1/65535 of each pair's range of coefficients
+    Raises ValueError when shapes and axes do not fit or a value is not finite.
+    """
+    axes = tuple(np.atleast_1d(np.asarray(axis, dtype="<f8")) for axis in axes)
+    values = np.asarray(values)
+    if len(axes) != 7 or values.ndim != 9 or values.shape[:7] != tuple(len(axis) for axis in axes):
+        raise ValueError("values have shape %s, which does not fit their axes" % (values.shape,))
+    if not (np.isfinite(values).all() and all(np.isfinite(axis).all() for axis in axes)):
+        raise ValueError("a response or axis value is not finite")
+    for number, nodes in enumerate(axes):
+        if len(nodes) > 1:
+            # A matrix from values to coefficients: its product is far faster than a solver for every pair.
+            fit = make_interp_spline(nodes, np.eye(len(nodes)), min(3, len(nodes) - 1)).c
+            before, after = int(np.prod(values.shape[:number])), int(np.prod(values.shape[number + 1 :]))
+            values = np.matmul(fit, values.reshape(before, len(nodes), after)).reshape(values.shape)
+    if bytes_per_value == 4:
+        return Table(kind, axes, np.ascontiguousarray(values, dtype="<f4"))
+    flat = values.reshape((-1,) + values.shape[7:])
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    scale = (high - low) / 65535.0
+    steps = np.rint((values - low) / np.where(scale > 0, scale, 1.0))
+    return Table(kind, axes, np.ascontiguousarray(steps, dtype="<u2"), low, scale)
+
+
+def write_tables(path, tables, mean, error=UNMEASURED):
+    """Write one map, atomically (a temporary file renamed into place).
+
+    mean    what sim_map_mean() returns          error   the four numbers of struct sim_map_error
+    """
+    sensors, emitters = tables[0].coefficients.shape[7:]
+    blocks = [struct.pack("<3I d 4d", sensors, emitters, len(tables), mean, *error)]
+    blocks += [table.header() for table in tables]
+    for table in tables:
+        blocks += table.blocks()
+    check = 0
+    for block in blocks:
+        check = zlib.crc32(block, check)
+    head = MAGIC + struct.pack("<QI", 20 + sum(len(block) for block in blocks), check)
+    temporary = "%s.%d.tmp" % (path, os.getpid())
+    try:
+        with open(temporary, "wb") as file:
+            file.write(head)
+            file.writelines(blocks)
+        os.replace(temporary, path)
+    except BaseException:
+        if os.path.exists(temporary):
+            os.unlink(temporary)
+        raise
 
 
 def write_map(
@@ -29,60 +112,43 @@ def write_map(
     glint,
     mean=None,
 ):
-    """Write one map, atomically (a temporary file renamed into place).
+    """Write a map of two tables from values at their nodes.
 
-    Axes are 1-d arrays, strictly increasing; `slip_mm` is three of them (x, y, z). Gaze axes are uniform
-    with 1 or >= 4 nodes.
+    Axes are 1-d arrays, strictly increasing; `slip_mm` is three of them (x, y, z).
     smooth   [slip x, slip y, slip z, pupil, lid, elevation, azimuth, sensor, emitter], relative irradiance
     glint    [slip x, slip y, slip z, lid, elevation, azimuth, sensor, emitter]
     mean     what sim_map_mean() returns; None = from the nodes nearest to pupil 3.5 mm, lids open, no slip.
     Raises ValueError when shapes and axes do not fit or a value is not finite.
     """
-    axes = [
-        _axis(pupil_mm),
-        _axis(lid_opening),
-        *(_axis(s) for s in slip_mm),
-        _axis(elevation_deg),
-        _axis(azimuth_deg),
-        _axis(glint_lid_opening),
-        _axis(glint_elevation_deg),
-        _axis(glint_azimuth_deg),
+    smooth, glint = np.asarray(smooth), np.asarray(glint)
+    if glint.ndim != 8 or smooth.ndim != 9 or glint.shape[6:] != smooth.shape[7:]:
+        raise ValueError("glint has shape %s, smooth %s" % (glint.shape, smooth.shape))
+    tables = [
+        fit_table(SMOOTH, (*slip_mm, pupil_mm, lid_opening, elevation_deg, azimuth_deg), smooth),
+        fit_table(
+            GLINT,
+            (*slip_mm, [PUPIL_ANY_MM], glint_lid_opening, glint_elevation_deg, glint_azimuth_deg),
+            glint[:, :, :, None],
+        ),
     ]
-    smooth = np.asarray(smooth, dtype="<f4")
-    glint = np.asarray(glint, dtype="<f4")
-    n = [len(a) for a in axes]
-    if smooth.ndim != 9 or smooth.shape[:7] != (n[2], n[3], n[4], n[0], n[1], n[5], n[6]):
-        raise ValueError("smooth has shape %s, which does not fit its axes" % (smooth.shape,))
-    if glint.shape != (n[2], n[3], n[4], n[7], n[8], n[9]) + smooth.shape[7:]:
-        raise ValueError("glint has shape %s, which does not fit its axes" % (glint.shape,))
-    if not (
-        np.isfinite(smooth).all() and np.isfinite(glint).all() and all(np.isfinite(a).all() for a in axes)
-    ):
-        raise ValueError("a response or axis value is not finite")
-    sensors, emitters = smooth.shape[7:]
     if mean is None:
-        mean = _mean_response(axes, smooth, glint)
-    body = struct.pack("<13I d", sensors, emitters, *n, 0, mean)
-    body += b"".join(a.tobytes() for a in axes) + smooth.tobytes() + glint.tobytes()
-    head = MAGIC + struct.pack("<QI", 20 + len(body), zlib.crc32(body))
-    temporary = "%s.%d.tmp" % (path, os.getpid())
-    with open(temporary, "wb") as file:
-        file.write(head + body)
-    os.replace(temporary, path)
+        mean = _mean_response(tables, smooth, glint[:, :, :, None])
+    write_tables(path, tables, mean)
 
 
-def _mean_response(axes, smooth, glint):
-    slip = tuple(int(np.argmin(abs(axes[2 + k]))) for k in range(3))
+PUPIL_ANY_MM = 3.5  # the one node of an axis on which a table does not depend
+
+
+def _mean_response(tables, smooth, glint):
     other = 1.0 - np.eye(*smooth.shape[7:]) if min(smooth.shape[7:]) > 1 else np.ones(smooth.shape[7:])
     total = 0.0
-    for table, el, az in (
-        (smooth[slip][np.argmin(abs(axes[0] - 3.5)), -1], axes[5], axes[6]),
-        (glint[slip][-1], axes[8], axes[9]),
-    ):
-        inside = table[abs(el) <= 20.0 + 1e-9][:, abs(az) <= 20.0 + 1e-9]
-        if inside.size == 0:
-            inside = table
-        total += float((np.asarray(inside, dtype=float).mean(axis=(0, 1)) * other).sum() / smooth.shape[7])
+    for table, values in zip(tables, (smooth, glint)):
+        slip = tuple(int(np.argmin(abs(axis))) for axis in table.axes[:3])
+        inside = values[slip][np.argmin(abs(table.axes[3] - 3.5)), -1]
+        near = [abs(axis) <= 20.0 + 1e-9 for axis in table.axes[5:]]
+        if near[0].any() and near[1].any():
+            inside = inside[near[0]][:, near[1]]
+        total += float((np.asarray(inside, dtype=float).mean(axis=(0, 1)) * other).sum() / len(other))
     return total
 
 

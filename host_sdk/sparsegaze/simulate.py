@@ -3,36 +3,34 @@
 one person.
 
 A map is tabulated once (`response_map`, kept in a cache by the hash of everything it depends on) and then
-evaluated at any state (`ResponseMap`, `evaluate`), smoothly between its nodes.
-
-Errors, divided by the mean response of a pair, default headset, lids open: between nodes against direct
-evaluation 2e-4 rms (tests/sim/test_maps.py); against much finer integration, interpolation included, up to
-1e-3 rms, nearly all of it a constant of the face; what varies with gaze is 1e-4. Lids half way between two
-nodes, as in a blink: 3e-3 rms, 4e-2 at most (a glint that a margin cuts).
+evaluated at any state (`ResponseMap`, `evaluate`, with derivatives `ResponseMap.gradient`), smoothly between
+its nodes. Every map says how wrong it is between them: `ResponseMap.error_estimate`.
 """
 
 import hashlib
 import os
-import threading
-from concurrent.futures import ThreadPoolExecutor
+from collections import namedtuple
 
 import numpy as np
 
 from .errors import SceneError
 from .headset import Headset, load_headset
-from .mapfile import write_map
+from .mapfile import AXES, PUPIL_ANY_MM, write_tables
 from .person import Person, draw_person, load_person
-from .scene import Scene, simulator
+from .scene import simulator
+from .tabulate import RANDOM_STATES, TABLES_VERSION, choose_glint_nodes, lid_nodes, measure_error, tabulate
 
-# Gaze goes beyond the +-20 degrees of the targets: saccades overshoot and blinks drag the eye. The pupil's
-# and lids' nodes
-# are closer where people mostly are.
+# Gaze goes beyond the +-20 degrees of the targets: saccades overshoot and blinks drag the eye.
 HALF_ANGLE_DEG = 25.0
 SMOOTH_GAZE_NODES = 31
-GLINT_GAZE_NODES = 61
-PUPIL_NODES_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
-LID_NODES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+PUPIL_NODES_MM = tuple(2.0 + 0.5 * k for k in range(13))
+# Nodes of the lids' opening by term: a margin of 0.8 mm cuts the glint, a point, and the skin beside it
+# sharply, the sclera and the iris as areas. About 1 mm of the margin's way is 0.1 of opening.
+LID_NODES = {"face": 41, "sclera": 21, "iris": 21, "glint": 21}
 PUPIL_NOMINAL_MM = 3.5
+# Fineness of the nodes' own values, where not the default's: an error there looks like structure.
+TABLE_QUALITY = {"sclera": 1.0, "iris": 1.0, "glint": 1.0, "face": 1.0}
+MEAN_HALF_DEG = 20.0
 
 # sim_map_mean() of headsets/led2gaze.toml on nominal_person(): the unit of light. physics.toml's
 # [photocurrent] gives the current of exactly this mean (nominal_na = 200 nA), so that a map of any other
@@ -71,34 +69,90 @@ def as_person(person):
 
 
 class Grid:
-    """Nodes of a map. The defaults are the product's; coarser ones make quick, rough maps for tests."""
+    """Nodes of a map. The defaults are the product's; coarser ones make quick, rough maps for tests.
+
+    glint_nodes    None: as many as the scene's lobes ask for
+    lid_opening    None: LID_NODES, uniform; else these for every term
+    quality        {field of struct sim_quality: value} for the nodes' values, over TABLE_QUALITY
+    check_states   number of random states at which the map's error is measured, lids open and again
+                   with any lids
+    """
 
     def __init__(
         self,
         half_angle_deg=HALF_ANGLE_DEG,
         smooth_nodes=SMOOTH_GAZE_NODES,
-        glint_nodes=GLINT_GAZE_NODES,
+        glint_nodes=None,
         pupil_mm=PUPIL_NODES_MM,
-        lid_opening=LID_NODES,
+        lid_opening=None,
         slip_mm=((0.0,), (0.0,), (0.0,)),
         quality=(),
+        check_states=RANDOM_STATES,
     ):
-        self.smooth_deg = np.linspace(-half_angle_deg, half_angle_deg, smooth_nodes)
-        self.glint_deg = np.linspace(-half_angle_deg, half_angle_deg, glint_nodes)
-        self.pupil_mm, self.lid_opening = np.array(pupil_mm, float), np.array(lid_opening, float)
+        self.half_angle_deg, self.smooth_nodes, self.glint_nodes = half_angle_deg, smooth_nodes, glint_nodes
+        self.pupil_mm = np.array(pupil_mm, float)
+        self.lid_opening = None if lid_opening is None else np.array(lid_opening, float)
         self.slip_mm = tuple(np.array(axis, float) for axis in slip_mm)
         self.quality = dict(quality)
+        self.check_states = int(check_states)
+
+    def table_quality(self):
+        """Fineness of the nodes' values by term."""
+        return {**TABLE_QUALITY, **self.quality}
 
     def describe(self):
         """Everything a map's values depend on, as text."""
-        arrays = (self.smooth_deg, self.glint_deg, self.pupil_mm, self.lid_opening) + self.slip_mm
-        return repr([a.tolist() for a in arrays] + [sorted(self.quality.items())])
+        lids = LID_NODES if self.lid_opening is None else self.lid_opening.tolist()
+        return repr(
+            (
+                (self.half_angle_deg, self.smooth_nodes, self.glint_nodes, self.pupil_mm.tolist(), lids),
+                [axis.tolist() for axis in self.slip_mm],
+                sorted(self.table_quality().items()),
+                self.check_states,
+            )
+        )
+
+    def nodes(self, scene, headset, person):
+        """{term: {axis: nodes}} for one scene."""
+        half, any_pupil = self.half_angle_deg, np.array([PUPIL_ANY_MM])
+        pairs = int(np.prod(scene.shape))
+        gaze = np.linspace(-half, half, self.smooth_nodes)
+        glint_nodes = self.glint_nodes
+        if glint_nodes is None:
+            glint_nodes = choose_glint_nodes(scene, headset, person, half)
+        fine = np.linspace(-half, half, glint_nodes)
+        values = {
+            "face": 4 * self.smooth_nodes,
+            "sclera": self.smooth_nodes**2,
+            "iris": self.smooth_nodes**2 * len(self.pupil_mm),
+            "glint": glint_nodes**2,
+        }
+        lids = {
+            term: np.linspace(0.0, 1.0, lid_nodes(LID_NODES[term], values[term] * pairs))
+            if self.lid_opening is None
+            else self.lid_opening
+            for term in LID_NODES
+        }
+        shut = np.array([0.0])
+        face = np.linspace(-half, half, 2 * self.smooth_nodes - 1)
+        return {
+            "face": dict(pupil_mm=any_pupil, lid_opening=lids["face"], elevation_deg=face, azimuth_deg=shut),
+            "sclera": dict(
+                pupil_mm=any_pupil, lid_opening=lids["sclera"], elevation_deg=gaze, azimuth_deg=gaze
+            ),
+            "iris": dict(
+                pupil_mm=self.pupil_mm, lid_opening=lids["iris"], elevation_deg=gaze, azimuth_deg=gaze
+            ),
+            "glint": dict(
+                pupil_mm=any_pupil, lid_opening=lids["glint"], elevation_deg=fine, azimuth_deg=fine
+            ),
+        }
 
 
 def map_name(headset, person, grid=None):
     """File name of a map: the hash of headset, person, nodes and the simulator's own source."""
     ffi, lib = simulator()
-    text = repr((headset.describe(), person.describe(), (grid or Grid()).describe()))
+    text = repr((headset.describe(), person.describe(), (grid or Grid()).describe(), TABLES_VERSION))
     text += ffi.string(lib.sim_source_hash).decode()
     return hashlib.sha256(text.encode()).hexdigest()[:32] + ".sgmap"
 
@@ -123,92 +177,40 @@ def response_map(headset, person, progress=None, cache=None, grid=None, workers=
         except SceneError:
             pass  # damaged: made again below
     os.makedirs(directory, exist_ok=True)
-    smooth, glint = _tabulate(headset, person, grid, progress, workers or min(2, os.cpu_count() or 1))
-    write_map(
-        path,
-        pupil_mm=grid.pupil_mm,
-        lid_opening=grid.lid_opening,
-        slip_mm=grid.slip_mm,
-        elevation_deg=grid.smooth_deg,
-        azimuth_deg=grid.smooth_deg,
-        smooth=smooth,
-        glint_lid_opening=grid.lid_opening,
-        glint_elevation_deg=grid.glint_deg,
-        glint_azimuth_deg=grid.glint_deg,
-        glint=glint,
-        mean=_mean_response(grid, smooth, glint),
-    )
+    write_made(path, headset, person, grid, progress, workers or min(2, os.cpu_count() or 1))
     return path
 
 
-def _tabulate(headset, person, grid, progress, workers):
-    """Both tables, [slip x, slip y, slip z, (pupil,) lid, elevation, azimuth, sensor, emitter]."""
-    slips = [
-        (i, j, k)
-        for i in range(len(grid.slip_mm[0]))
-        for j in range(len(grid.slip_mm[1]))
-        for k in range(len(grid.slip_mm[2]))
-    ]
-    n_slip = tuple(len(axis) for axis in grid.slip_mm)
-    pairs = (len(headset.sensors), len(headset.emitters))
-    n_smooth, n_glint, n_lid = len(grid.smooth_deg), len(grid.glint_deg), len(grid.lid_opening)
-    smooth = np.empty(n_slip + (len(grid.pupil_mm), n_lid, n_smooth, n_smooth) + pairs, np.float32)
-    glint = np.empty(n_slip + (n_lid, n_glint, n_glint) + pairs, np.float32)
-    lock, done = threading.Lock(), [0]
-    # One row of smooth nodes costs about three times what a row node of the glint does.
-    total = len(slips) * (3 * n_smooth * n_smooth + n_glint * n_glint)
-
-    def report(units):
-        with lock:
-            done[0] += units
-            if progress:
-                progress(min(1.0, done[0] / total))
-
-    def smooth_row(scene, at, row):
-        elevation = float(grid.smooth_deg[row])
-        # The face does not see where the eye looks sideways, only where the lids are.
-        face = scene.smooth(0.0, elevation, grid.pupil_mm[:1], grid.lid_opening, "face")
-        for column, azimuth in enumerate(grid.smooth_deg):
-            eye = scene.smooth(float(azimuth), elevation, grid.pupil_mm, grid.lid_opening, "eye")
-            smooth[at + (slice(None), slice(None), row, column)] = eye + face
-        report(3 * n_smooth)
-
-    def glint_row(scene, at, row):
-        for column, azimuth in enumerate(grid.glint_deg):
-            value = scene.glint(float(azimuth), float(grid.glint_deg[row]), grid.lid_opening)
-            glint[at + (slice(None), row, column)] = value
-        report(n_glint)
-
-    with ThreadPoolExecutor(max_workers=workers) as pool:
-        for at in slips:
-            slip = [grid.slip_mm[axis][at[axis]] for axis in range(3)]
-            scene = Scene(headset, person, slip, grid.quality)
-            jobs = [pool.submit(smooth_row, scene, at, row) for row in range(n_smooth)]
-            jobs += [pool.submit(glint_row, scene, at, row) for row in range(n_glint)]
-            for job in jobs:
-                job.result()
-    return smooth, glint
+def write_made(path, headset, person, grid, progress=None, workers=1):
+    """Tabulate a map, measure its mean and its error, and write it."""
+    tables, values, nodes = tabulate(headset, person, grid, progress, workers)
+    draft = "%s.%d.draft" % (path, os.getpid())
+    try:
+        write_tables(draft, tables, 1.0)
+        with ResponseMap(draft) as opened:
+            mean = mean_response(opened, min(MEAN_HALF_DEG, grid.half_angle_deg))
+            error = measure_error(opened.evaluate, headset, person, grid, values, nodes)
+    finally:
+        if os.path.exists(draft):
+            os.unlink(draft)
+    write_tables(path, tables, mean, error)
 
 
-def _mean_response(grid, smooth, glint):
-    """What sim_map_mean() promises, from the two tables by interpolation of neither: means over their own
-    gaze nodes.
+def mean_response(opened, half_deg=MEAN_HALF_DEG):
+    """What sim_map_mean() promises, of an open map: by 24 x 24 Gauss-Legendre nodes."""
+    at, weight = np.polynomial.legendre.leggauss(24)
+    elevation, azimuth = np.meshgrid(half_deg * at, half_deg * at, indexing="ij")
+    response = opened.evaluate(np.column_stack([azimuth.ravel(), elevation.ravel()]))
+    mean = np.tensordot(np.outer(weight, weight).ravel() / 4, response, 1)
+    if min(mean.shape) > 1:
+        np.fill_diagonal(mean, 0.0)
+    return float(mean.sum() / len(mean))
 
-    The pupil is interpolated between its nodes (quadratic: the area counts).
-    """
-    slip = tuple(int(np.argmin(np.abs(axis))) for axis in grid.slip_mm)
-    pupil = np.array(
-        [np.interp(PUPIL_NOMINAL_MM**2, grid.pupil_mm**2, row) for row in np.eye(len(grid.pupil_mm))]
-    )
-    opened = np.tensordot(pupil, smooth[slip].astype(float), 1)[-1]
-    total = 0.0
-    for table, nodes in ((opened, grid.smooth_deg), (glint[slip][-1].astype(float), grid.glint_deg)):
-        inside = np.abs(nodes) <= 20.0 + 1e-9
-        mean = table[inside][:, inside].mean(axis=(0, 1))
-        if min(mean.shape) > 1:
-            np.fill_diagonal(mean, 0.0)
-        total += mean.sum() / len(mean)
-    return total
+
+ErrorEstimate = namedtuple("ErrorEstimate", "open_rms open_max lids_rms lids_max")
+ErrorEstimate.__doc__ = """Errors of a map's responses, bounds for states that were not looked at: divided by
+the mean response of a pair. open_: lids open; lids_: lids anywhere; _rms: of many states; _max: of any. NaN
+where nobody measured."""
 
 
 class ResponseMap:
@@ -226,6 +228,14 @@ class ResponseMap:
         self._map = self._ffi.gc(made, self._lib.sim_map_close)
         self.shape = (self._lib.sim_map_sensors(made), self._lib.sim_map_emitters(made))
         self.mean = self._lib.sim_map_mean(made)
+        others = self.shape[1] - (min(self.shape) > 1)
+        stated = self._lib.sim_map_error(made)
+        self.error_estimate = ErrorEstimate(
+            *(
+                np.nan if value < 0 else value * others / self.mean
+                for value in (getattr(stated, name) for name in ErrorEstimate._fields)
+            )
+        )
 
     def close(self):
         """Free the tables; the map cannot be used afterwards."""
@@ -239,13 +249,19 @@ class ResponseMap:
     def __exit__(self, *_):
         self.close()
 
-    def axis(self, number):
-        """Nodes of one axis, numbered as in the file: pupil, lid, slip x y z, elevation, azimuth, then the
-        glint's.
-        """
+    def axis(self, table, name):
+        """Nodes of an axis (one of mapfile.AXES) of a table, numbered as in the file; [] where there is none."""
         nodes = self._ffi.new("double **")
-        count = self._lib.sim_map_axis(self._map, number, nodes)
+        count = self._lib.sim_map_axis(self._map, table, AXES.index(name), nodes)
         return np.array([nodes[0][i] for i in range(count)])
+
+    def _states(self, states):
+        """States [n, 2..7] filled up to [n, 7]."""
+        states = np.atleast_2d(np.asarray(states, float))
+        full = np.zeros((len(states), len(STATE_FIELDS)))
+        full[:, 2:4] = PUPIL_NOMINAL_MM, 1.0
+        full[:, : states.shape[1]] = states
+        return full
 
     def evaluate(self, states):
         """Responses [n, sensor, emitter] at states [n, 2..7]: STATE_FIELDS in order.
@@ -253,21 +269,49 @@ class ResponseMap:
         What is missing of a state: pupil 3.5 mm, lids open, no slip. Outside the map it is clamped.
         Raises SceneError when a state is not finite.
         """
-        states = np.atleast_2d(np.asarray(states, float))
-        full = np.zeros((len(states), len(STATE_FIELDS)))
-        full[:, 2:4] = PUPIL_NOMINAL_MM, 1.0
-        full[:, : states.shape[1]] = states
+        full = self._states(states)
         out = np.empty((len(full),) + self.shape)
-        buffer = self._ffi.from_buffer("double[]", full)
         bad = self._lib.sim_map_eval_many(
             self._map,
-            self._ffi.cast("struct sim_state *", buffer),
+            self._ffi.cast("struct sim_state *", self._ffi.from_buffer("double[]", full)),
             len(full),
             self._ffi.from_buffer("double[]", out),
         )
         if bad:
             raise SceneError("%d states are not finite" % bad, "correct the states")
         return out
+
+    def parts(self, states):
+        """(smooth terms, glint), each [n, sensor, emitter]: their sum is the response, before it is cut at 0."""
+        full = self._states(states)
+        terms = np.empty((2, len(full)) + self.shape)
+        state = self._ffi.cast("struct sim_state *", self._ffi.from_buffer("double[]", full))
+        smooth, glint = (self._ffi.from_buffer("double[]", term) for term in terms)
+        pairs = self.shape[0] * self.shape[1]
+        for i in range(len(full)):
+            if self._lib.sim_map_eval_parts(self._map, state + i, smooth + i * pairs, glint + i * pairs):
+                raise SceneError("state %d is not finite" % i, "correct the states")
+        return terms[0], terms[1]
+
+    def gradient(self, states):
+        """(responses [n, sensor, emitter], derivatives [n, 7, sensor, emitter] by STATE_FIELDS) at states as
+        for `evaluate`; per degree, per mm and per unit of lid opening.
+
+        0 where the state is clamped, and along what the map has one node for: slip, unless it was asked for.
+        """
+        full = self._states(states)
+        out = np.empty((len(full),) + self.shape)
+        slope = np.empty((len(full), len(STATE_FIELDS)) + self.shape)
+        state = self._ffi.cast("struct sim_state *", self._ffi.from_buffer("double[]", full))
+        values = self._ffi.from_buffer("double[]", out)
+        slopes = self._ffi.from_buffer("double[]", slope)
+        pairs = self.shape[0] * self.shape[1]
+        for i in range(len(full)):
+            if self._lib.sim_map_eval_gradient(
+                self._map, state + i, values + i * pairs, slopes + i * pairs * len(STATE_FIELDS)
+            ):
+                raise SceneError("state %d is not finite" % i, "correct the states")
+        return out, slope
 
 
 def evaluate(path, states):
