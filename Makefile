@@ -2,7 +2,7 @@
 # The one entry point; CI runs `make test`. `make` alone lists what there is.
 #
 #   SEED=k       the simulated person, parts and noise of `make demo`; SEEDS="..." those of `make seeds`
-#   ARGS="..."   handed on: to tools/demo.py by `make demo`, to pytest by `make test`
+#   ARGS="..."   handed on: to tools/demo.py by `make demo`, to pytest by `make test`, to tools/bench by `make bench-sim`
 #   PYTHON=...   the interpreter that .venv is made with
 
 SHELL := /bin/sh
@@ -26,10 +26,10 @@ quietly = echo "$(1)"; { $(1); } >build/native/log 2>&1 || { cat build/native/lo
 # $(1) over $(2) when it differs, at one stroke because somebody may be reading; then the command $(3).
 refresh = cmp -s $(1) $(2) || { cp $(1) $(2).new && mv $(2).new $(2) && $(if $(3),$(3),:); }
 
-.PHONY: help setup firmware native demo seeds test check size lock clean distclean
+.PHONY: help setup firmware native demo seeds test bench-sim check size lock clean distclean
 
 help: ## this list
-	@sed -n 's/^\([a-z]*\):[^#]*## \(.*\)/  make \1#\2/p' $(MAKEFILE_LIST) | \
+	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/  make \1#\2/p' $(MAKEFILE_LIST) | \
 	    awk -F'#' '{ printf "%-18s%s\n", $$1, $$2 }'
 
 setup: ## install what is missing: Debian packages (when root or sudo), .venv with pinned packages
@@ -66,6 +66,10 @@ seeds: setup firmware native ## the demo on many persons: make seeds SEEDS="1 2 
 test: setup firmware native ## every test; ARGS="-k name" for some
 	@$(PY) -m pytest $(ARGS)
 
+bench-sim: setup native ## the simulator's speed against its error, with peers; ARGS="--quick --no-peers"
+	@sh tools/bench/setup_bench.sh
+	@$(PY) tools/bench/bench_sim.py $(ARGS)
+
 check: firmware ## the quick static checks: includes, licences, packaging, link
 	@$(PY) tests/check_includes.py
 	@$(PY) -m pytest -q tests/build $(ARGS)
@@ -74,14 +78,16 @@ size: firmware ## flash and SRAM that the firmware takes, by section and by larg
 	@$(BINUTILS)/avr-size -A -d build/firmware/firmware.elf
 	@$(BINUTILS)/avr-nm -S --size-sort -r -t d build/firmware/firmware.elf | head -n 20
 
-lock: ## write requirements.txt anew from requirements.in, with hashes
+lock: ## write requirements.txt and requirements-bench.txt anew from their .in, with hashes
 	@python3 -m venv build/lock && build/lock/bin/pip install -qq uv
 	@build/lock/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
 	    -o requirements.txt requirements.in
+	@build/lock/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
+	    -o requirements-bench.txt requirements-bench.in
 
 clean: ## remove everything built; .venv stays
 	@rm -rf build .pio .pio-offline $(SDK)/*.so $(SDK)/_core.c $(SDK)/_sim.c $(SDK)/*.o host_sdk/*.egg-info
 	@if [ -f tools/vheadset/Makefile ]; then $(MAKE) --no-print-directory -C tools/vheadset clean; fi
 
-distclean: clean ## remove .venv as well
-	@rm -rf .venv
+distclean: clean ## remove .venv and .venv-bench as well
+	@rm -rf .venv .venv-bench
