@@ -23,16 +23,34 @@ struct sim_window {
 
 enum { SIM_MAX_RULE = 24 };
 
-// A spot of the skin that an open eye may take the place of, as the lids see it.
+// Spots of the skin that an open eye may take the place of: columns of even steps in y. Between two spots lie
+// SIM_SUB points at which the lids' mask is taken; light is interpolated to them.
+enum { SIM_SUB = 4 };
+
 struct sim_lid_spot {
-    double alpha, beta, rho;
+    double alpha, beta, rho;  // as the lids see it; beta out of reach where no lid can be
+};
+
+// About how many views of a site from a spot of the skin are worth their time, when hard shadows want more.
+#define SIM_MOST_VIEWS 1.5e6
+
+struct sim_lid_column {
+    int first, n;  // of its spots; the first and the last three are there for interpolation only
 };
 
 // What the quadrature of the skin met, for reports.
 struct sim_skin_facts {
-    int spots, lid_spots, lid_spots_left_out;  // evaluated; kept for lid poses; without light worth keeping
-    double lid_step_mm;                        // spacing of the latter
+    int spots, lid_spots;  // evaluated for the closed lids' sum; kept for lid poses
+    double lid_step_mm;    // spacing of the latter
+    double tolerance;      // of one panel of the former, in units of the pairs' mean
     unsigned char penumbra[2 * SIM_MAX_PORTS];  // whether a site's lens is partly hidden from any lit spot
+};
+
+// The skin at one place and both ends' factors there.
+struct sim_skin_spot {
+    double position[3], slope[2], normal[3], stretch;  // stretch: area per area of the frontal plane
+    double sensor_part[SIM_MAX_PORTS], emitter_part[SIM_MAX_PORTS];
+    int penumbra;  // of lenses whose shadows are narrow, one crosses the spot
 };
 
 struct sim_scene {
@@ -50,8 +68,9 @@ struct sim_scene {
     struct sim_profile profile;            // of the eye, for the glint
     double *face_all;    // [sensors][emitters] response of all skin with the lids closed
     double *face_spots;  // [n_lid_spots][sensors + emitters], of what an open eye may replace
-    struct sim_lid_spot *lid_spots;
-    int n_lid_spots;
+    struct sim_lid_spot *lid_spots;  // [n_lid_spots][1 + SIM_SUB]: the spot, then the points after it
+    struct sim_lid_column *lid_columns;
+    int n_lid_spots, n_lid_columns;
     struct sim_skin_facts skin_facts;
 };
 
@@ -78,5 +97,16 @@ void sim_add_face(const struct sim_scene *scene, double elevation_deg, double op
 // Integrates the skin with closed lids, and keeps the spots that lids may cut. Returns 0, or -1 for lack of
 // memory.
 int sim_prepare_face(struct sim_scene *scene);
+
+// One spot of the skin. Returns a bound on any pair's response per area of the frontal plane; what is below
+// dark_per_area is not looked into.
+double sim_skin_at(struct sim_scene *scene, double x, double y, double dark_per_area, struct sim_skin_spot *spot);
+
+// Keeps the spots that lids may cut, but for those without light (dark: of one spot, as a response). Returns 0, or
+// -1 for lack of memory.
+int sim_keep_opening(struct sim_scene *scene, double dark);
+
+// out[sensors][emitters] -= what the open eye takes the place of.
+void sim_cut_opening(const struct sim_scene *scene, const struct sim_lid *lid, double *out);
 
 #endif

@@ -7,6 +7,7 @@
 #include "sim_inside.h"
 
 #define PI 3.14159265358979323846
+static const double LEAST_SIGMA_DEG = 0.5, FARTHEST_MM = 1e4, WILDEST = 1e4;
 
 struct sim_quality sim_quality_default(void) {
     struct sim_quality q = {.sclera = 1, .iris = 1, .glint = 1, .face = 1, .tolerance = 0};
@@ -44,6 +45,14 @@ static int check_person(const struct sim_person *p, char *error, size_t bytes) {
     memcpy(number, p, sizeof number);
     for (size_t i = 0; i < sizeof number / sizeof *number; ++i)
         if (!isfinite(number[i])) return refuse(error, bytes, "a number of the person is not finite");
+    for (size_t i = 0; i < sizeof number / sizeof *number; ++i)
+        if (fabs(number[i]) > WILDEST) return refuse(error, bytes, "a number of the person is beyond all anatomy");
+    if (fabs(p->kappa_azimuth_deg) > 45 || fabs(p->kappa_elevation_deg) > 45)
+        return refuse(error, bytes, "kappa is beyond 45 degrees");
+    if (fabs(p->brow_mm) > 60 || fabs(p->nose_mm) > 60 || fabs(p->cheek_mm) > 60)
+        return refuse(error, bytes, "brow, nose or cheek is beyond 60 mm");
+    if (fabs(p->lid_upper_follow) > 3 || fabs(p->lid_lower_follow) > 3 || fabs(p->canthus_tilt_deg) > 45)
+        return refuse(error, bytes, "the lids' motion or tilt is impossible");
     double curve = p->cornea_radius_mm * p->cornea_radius_mm -
                    (1 + p->cornea_asphericity) * p->limbus_radius_mm * p->limbus_radius_mm;
     if (!(p->cornea_radius_mm > 0 && p->globe_radius_mm > p->limbus_radius_mm && p->limbus_radius_mm > 0 &&
@@ -71,6 +80,24 @@ static int check_person(const struct sim_person *p, char *error, size_t bytes) {
     return 0;
 }
 
+// Whether the edge of a lens (a disc across its aim) reaches into the eye or the face.
+static int touches(const struct sim_scene *scene, const double at[3], const struct sim_port *port) {
+    double size = sqrt(sim_dot(port->aim, port->aim)), a[3], u[3], v[3];
+    for (int k = 0; k < 3; ++k) a[k] = port->aim[k] / size;
+    int least = fabs(a[0]) < fabs(a[1]) ? 0 : 1;
+    for (int k = 0; k < 3; ++k) u[k] = (k == least) - a[least] * a[k];
+    size = sqrt(sim_dot(u, u));
+    for (int k = 0; k < 3; ++k) u[k] /= size;
+    for (int k = 0; k < 3; ++k) v[k] = a[(k + 1) % 3] * u[(k + 2) % 3] - a[(k + 2) % 3] * u[(k + 1) % 3];
+    for (int i = 0; i < 16; ++i) {
+        double c = port->radius_mm * cos(i * PI / 8), s = port->radius_mm * sin(i * PI / 8), rim[3];
+        for (int k = 0; k < 3; ++k) rim[k] = at[k] + c * u[k] + s * v[k];
+        if (sim_dot(rim, rim) < scene->eye.apex * scene->eye.apex) return 1;
+        if (-rim[2] < sim_face_height(&scene->person, rim[0], rim[1])) return 1;
+    }
+    return 0;
+}
+
 static int check_port(const struct sim_scene *scene, const double at[3], const struct sim_port *port,
                       const char *what, int number, char *error, size_t bytes) {
     const struct sim_person *p = &scene->person;
@@ -81,11 +108,14 @@ static int check_port(const struct sim_scene *scene, const double at[3], const s
     if (!(isfinite(size) && isfinite(distance) && isfinite(port->sigma_deg) && isfinite(port->radius_mm)))
         why = "has a number that is not finite";
     else if (!(size > 0)) why = "has no aim";
-    else if (!(port->sigma_deg > 0 && port->sigma_deg <= 85))
-        why = "has an angular sigma outside 0..85 degrees";
+    else if (!(port->sigma_deg >= LEAST_SIGMA_DEG && port->sigma_deg <= 85))
+        why = "has an angular sigma outside 0.5..85 degrees";
+    else if (distance > FARTHEST_MM) why = "is more than 10 m away";
     else if (distance < nearest + 0.2) why = "is inside the eyeball or touches it at some gaze";
     else if (-at[2] < sim_face_height(p, at[0], at[1]) + 0.2) why = "is inside or behind the face";
-    else if (!(port->radius_mm >= 0 && port->radius_mm < distance / 4)) why = "has an impossible radius";
+    else if (!(port->radius_mm >= 0)) why = "has a lens of negative radius";
+    else if (!(port->radius_mm < distance / 4)) why = "has a lens too large for its distance (a quarter of it)";
+    else if (touches(scene, at, port)) why = "has a lens that reaches into the eye or the face";
     if (!why) return 0;
     snprintf(text, sizeof text, "%s %d %s", what, number, why);
     return refuse(error, bytes, text);
@@ -183,6 +213,34 @@ struct sim_scene *sim_scene_open(const struct sim_person *person, const struct s
     return scene;
 }
 
+static int site_of(const struct sim_scene *scene, int emitter, int number) {
+    if (number < 0 || number >= (emitter ? scene->n_emitters : scene->n_sensors)) return -1;
+    return emitter ? scene->emitters[number].site : scene->sensors[number].site;
+}
+
+int sim_scene_port_facts(const struct sim_scene *scene, int emitter, int number, struct sim_port_facts *facts) {
+    int site = site_of(scene, emitter, number);
+    if (site < 0) return -1;
+    facts->eye_clear = scene->face.eye_clear[site];
+    facts->skin_clear = !scene->skin_facts.penumbra[site];
+    facts->widened_mm = scene->face.lens[site] > scene->sites[site].radius ? scene->face.lens[site] : 0;
+    return 0;
+}
+
+double sim_scene_eye_reach(const struct sim_scene *scene, int emitter, int number, double alpha_deg,
+                           double beta_deg) {
+    int site = site_of(scene, emitter, number);
+    if (site < 0 || !(fabs(alpha_deg) <= 90 && fabs(beta_deg) <= 90)) return NAN;
+    return sim_face_eye_reach(&scene->face, site, alpha_deg * SIM_RADIANS, beta_deg * SIM_RADIANS);
+}
+
+void sim_scene_face_facts(const struct sim_scene *scene, struct sim_face_facts *facts) {
+    facts->panel_spots = scene->skin_facts.spots;
+    facts->panel_tolerance = scene->skin_facts.tolerance;
+    facts->lid_spots = scene->skin_facts.lid_spots;
+    facts->lid_step_mm = scene->skin_facts.lid_step_mm;
+}
+
 void sim_scene_close(struct sim_scene *scene) {
     if (!scene) return;
     sim_face_close(&scene->face);
@@ -190,6 +248,7 @@ void sim_scene_close(struct sim_scene *scene) {
     free(scene->face_all);
     free(scene->face_spots);
     free(scene->lid_spots);
+    free(scene->lid_columns);
     free(scene);
 }
 

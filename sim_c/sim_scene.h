@@ -71,6 +71,29 @@ int sim_scene_smooth(const struct sim_scene *scene, double azimuth_deg, double e
 int sim_scene_glint(const struct sim_scene *scene, double azimuth_deg, double elevation_deg,
                     const double *lid_opening, int n_lids, double *out);
 
+// What the face does to one port, as far as it was found to matter.
+struct sim_port_facts {
+    int eye_clear;      // 1 = hides nothing of its lens from what open lids show at gazes within 30 degrees
+    int skin_clear;     // 1 = no shadow's edge falls on skin that the scene's light reaches
+    double widened_mm;  // the radius that softens its shadows, where its own is smaller; else 0
+};
+
+// How the skin was integrated.
+struct sim_face_facts {
+    int panel_spots, lid_spots;  // evaluated for closed lids; kept for lid poses (0 = no light on lids)
+    double panel_tolerance;      // a panel's change when halved, in units of the mean response of pairs
+    double lid_step_mm;          // spacing of the latter
+};
+
+// Facts about a sensor (emitter = 0) or an emitter (1). Returns 0, or -1 when there is no such port.
+int sim_scene_port_facts(const struct sim_scene *scene, int emitter, int number, struct sim_port_facts *facts);
+void sim_scene_face_facts(const struct sim_scene *scene, struct sim_face_facts *facts);
+
+// Share of a port's lens that the face leaves to the eye in the direction (alpha to +x, beta up, as the lids
+// have it), 0..1; NAN when there is no such port or direction.
+double sim_scene_eye_reach(const struct sim_scene *scene, int emitter, int number, double alpha_deg,
+                           double beta_deg);
+
 // Height of the face over the frontal plane (mm forward of the centre of rotation), for pictures and checks.
 double sim_person_face_mm(const struct sim_person *person, double x_mm, double y_mm);
 

@@ -22,6 +22,7 @@ SOURCES = (
     "sim_lid.c",
     "sim_face.c",
     "sim_skin.c",
+    "sim_opening.c",
     "sim_diffuse.c",
     "sim_mirror.c",
     "sim_glint.c",
