@@ -32,6 +32,7 @@ struct pair_view {
     const double *a, *b;  // site positions, eye frame
     int site_a, site_b;
     double alpha, alpha2, cut;  // cut: slope^2 / alpha^2 beyond which nothing is taken
+    double near;                // how closely a ring's centre must be found, in slope
     struct sim_facing start;
 };
 
@@ -192,7 +193,7 @@ static void add_ring(struct pair_view *view, double theta, double weight) {
     const struct sim_scene *scene = view->gaze->scene;
     struct sim_ring ring;
     sim_ring_at(&scene->eye, theta, &ring);
-    sim_ring_face(&ring, view->a, view->b, &view->start);
+    sim_ring_face(&ring, view->a, view->b, view->near, &view->start);
     const struct sim_facing *at = &view->start;
     double reach = sqrt(view->cut) * view->alpha;
     if (fabs(at->miss) > 1.3 * reach) return;
@@ -219,7 +220,7 @@ static void add_ring(struct pair_view *view, double theta, double weight) {
     if (!axial) return;
     // A second azimuth may be as near.
     struct sim_facing other = {.c = -at->c, .s = -at->s};
-    sim_ring_face(&ring, view->a, view->b, &other);
+    sim_ring_face(&ring, view->a, view->b, view->near, &other);
     double angle = atan2(other.s * at->c - other.c * at->s, other.c * at->c + other.s * at->s);
     int index = (int)floor(angle / step + 0.5), from = covered[1] + 1, to = covered[0] - 1 + n;
     if (index < covered[0]) index += n;
@@ -243,7 +244,7 @@ static int arcs_kind(const struct pair_view *view, double theta) {
 static void add_panels(struct pair_view *view, double from, double to, double steepest) {
     const struct sim_scene *scene = view->gaze->scene;
     double widths = (to - from) * steepest / view->alpha, length = (to - from) * scene->eye.apex;
-    int panels = (int)ceil(fmax(widths / 7, length / 2.5));
+    int panels = (int)ceil(fmax(widths / 12, length / 4));
     if (panels < 1) panels = 1;
     int points = panel_points(scene, fmax(widths, length / 0.6) / panels);
     const double *x = scene->rule[points], *w = x + points;
@@ -278,11 +279,14 @@ static void add_pair(struct gaze *gaze, int a, int b) {
     struct pair_view view = {.gaze = gaze, .a = gaze->sites[a], .b = gaze->sites[b], .site_a = a, .site_b = b};
     view.alpha2 = rough * rough + gaze->widen[a] + gaze->widen[b];
     view.alpha = sqrt(view.alpha2);
-    view.cut = fmin(fmax(12 + 6 * fine, 5), 30);
+    view.cut = fmin(fmax(11 + 6 * fine, 5), 30);
+    view.near = fmin(0.3 * view.alpha, 0.03);
     sim_facing_start(view.a, view.b, &view.start);
     struct sim_stretch stretches[SIM_STRETCHES];
-    int n = sim_profile_scan(&scene->profile, &scene->eye, view.a, view.b,
-                             1.15 * sqrt(view.cut) * view.alpha, stretches);
+    double reach = sqrt(view.cut) * view.alpha;
+    // Of a wide lobe the linear miss is but an estimate.
+    int n = sim_profile_scan(&scene->profile, &scene->eye, view.a, view.b, reach * (1 + fmin(reach, 0.2)),
+                             stretches);
     for (int i = 0; i < n; ++i) add_stretch(&view, &stretches[i]);
 }
 

@@ -59,7 +59,7 @@ void sim_profile_init(struct sim_profile *profile, const struct sim_eye *eye) {
     for (int p = 0; p < n; ++p) {
         profile->first[p] = profile->n_rings;
         double width = ends[p + 1] - ends[p];
-        int cells = (int)ceil(width * (p + 1 < n ? 26 : 15));
+        int cells = (int)ceil(width * (p + 1 < n ? 24 : 9));
         if (cells < 5) cells = 5;
         int room = SIM_PROFILE_RINGS - 1 - profile->n_rings - 6 * (n - 1 - p);
         if (cells > room) cells = room;
@@ -77,7 +77,7 @@ void sim_facing_start(const double a[3], const double b[3], struct sim_facing *f
 }
 
 void sim_ring_face(const struct sim_ring *ring, const double a[3], const double b[3],
-                   struct sim_facing *facing) {
+                   double tolerance, struct sim_facing *facing) {
     double r = ring->r, out = ring->n_out, up = ring->n_up, az = a[2] - ring->z, bz = b[2] - ring->z;
     double c = facing->c, s = facing->s;
     for (int i = 0;; ++i) {
@@ -109,7 +109,7 @@ void sim_ring_face(const struct sim_ring *ring, const double a[3], const double 
         facing->pace = pace;
         facing->miss = (st * dm - sm * dt) / (pace + 1e-300);
         double x = pace2 > 1e-24 ? -(sm * dm + st * dt) / pace2 : 0;
-        if (fabs(x) * fmax(1, pace) < 2e-3 || i == 12) {
+        if (fabs(x) * (1 + pace) < tolerance || i == 20) {
             facing->c = c - x * s;
             facing->s = s + x * c;
             double n = 1 / sqrt(facing->c * facing->c + facing->s * facing->s);
@@ -134,7 +134,7 @@ struct node {
 struct scan {
     const struct sim_eye *eye;
     const double *a, *b;
-    double reach;
+    double reach, tolerance;
     struct sim_stretch *out;
     int n, open;  // stretches so far; whether the last one is in this piece
 };
@@ -142,7 +142,7 @@ struct scan {
 static struct node node_at(const struct scan *scan, const struct sim_ring *ring,
                            const struct sim_facing *start) {
     struct node node = {.theta = ring->theta, .facing = *start};
-    sim_ring_face(ring, scan->a, scan->b, &node.facing);
+    sim_ring_face(ring, scan->a, scan->b, scan->tolerance, &node.facing);
     node.miss = node.facing.miss / sqrt(1 + node.facing.miss * node.facing.miss);
     return node;
 }
@@ -196,7 +196,9 @@ static void halve(struct scan *scan, const struct node *lo, const struct node *h
 
 int sim_profile_scan(const struct sim_profile *profile, const struct sim_eye *eye, const double a[3],
                      const double b[3], double reach, struct sim_stretch *out) {
-    struct scan scan = {.eye = eye, .a = a, .b = b, .reach = reach / sqrt(1 + reach * reach), .out = out};
+    struct scan scan = {.eye = eye, .a = a, .b = b, .out = out};
+    scan.reach = reach / sqrt(1 + reach * reach);
+    scan.tolerance = fmin(0.1 * reach, 0.03);
     struct node nodes[SIM_PROFILE_RINGS];
     struct sim_facing start;
     sim_facing_start(a, b, &start);

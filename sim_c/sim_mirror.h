@@ -49,8 +49,9 @@ void sim_ring_at(const struct sim_eye *eye, double theta, struct sim_ring *ring)
 
 void sim_profile_init(struct sim_profile *profile, const struct sim_eye *eye);
 
-// Newton's way to the azimuth of least slope. Start anywhere in the half that faces the sites.
-void sim_ring_face(const struct sim_ring *ring, const double a[3], const double b[3],
+// Newton's way to the azimuth of least slope. Start anywhere in the half that faces the sites. tolerance: of
+// the slope's change by the last step but one; the miss is good to its square.
+void sim_ring_face(const struct sim_ring *ring, const double a[3], const double b[3], double tolerance,
                    struct sim_facing *facing);
 
 // Azimuth to start from: the sites' mean direction.
