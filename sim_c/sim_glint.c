@@ -9,6 +9,7 @@
 // reach. Cost so depends on the number of lobes, not on their width. Where a site sets behind the eye's own
 // horizon within the lobe, the ring's visible arcs get panels of their own.
 #include <math.h>
+#include <stdatomic.h>
 #include <string.h>
 
 #include "sim_inside.h"
@@ -24,6 +25,7 @@ struct gaze {
     struct sim_lid lids[SIM_MAX_LIDS];
     int n_lids;
     double *out;
+    long long counts[3];  // as sim_scene_glint_counts()
 };
 
 // Of one pair of sites.
@@ -288,6 +290,7 @@ static void add_pair(struct gaze *gaze, int a, int b) {
     int n = sim_profile_scan(&scene->profile, &scene->eye, view.a, view.b, reach * (1 + fmin(reach, 0.2)),
                              stretches);
     for (int i = 0; i < n; ++i) add_stretch(&view, &stretches[i]);
+    ++gaze->counts[n ? 1 : 2];
 }
 
 static int pair_used(const struct sim_scene *scene, int a, int b) {
@@ -303,33 +306,89 @@ static void turn_to_eye(const double axes[9], const double head[3], double eye[3
     for (int j = 0; j < 3; ++j) eye[j] = axes[j] * head[0] + axes[3 + j] * head[1] + axes[6 + j] * head[2];
 }
 
-int sim_scene_glint(const struct sim_scene *scene, double azimuth_deg, double elevation_deg,
-                    const double *lid_opening, int n_lids, double *out) {
-    if (n_lids < 1 || n_lids > SIM_MAX_LIDS || !(fabs(azimuth_deg) <= 60 && fabs(elevation_deg) <= 60))
-        return -1;
-    struct gaze gaze;
-    gaze.scene = scene;
-    gaze.n_lids = n_lids;
-    gaze.out = out;
-    for (int i = 0; i < n_lids; ++i) {
-        if (!(lid_opening[i] >= 0 && lid_opening[i] <= 1)) return -1;
-        sim_lid_pose(&gaze.lids[i], &scene->person, elevation_deg, lid_opening[i]);
-    }
-    memset(out, 0, (size_t)(n_lids * scene->n_sensors * scene->n_emitters) * sizeof *out);
-    sim_eye_orient(&scene->eye, azimuth_deg, elevation_deg, gaze.axes);
+// The eye frame's part of a gaze.
+static void turn_scene(struct gaze *gaze, const struct sim_scene *scene, double azimuth_deg,
+                       double elevation_deg) {
+    gaze->scene = scene;
+    sim_eye_orient(&scene->eye, azimuth_deg, elevation_deg, gaze->axes);
     for (int k = 0; k < scene->n_sites; ++k) {
-        double *at = gaze.sites[k];
-        turn_to_eye(gaze.axes, scene->sites[k].position, at);
+        double *at = gaze->sites[k];
+        turn_to_eye(gaze->axes, scene->sites[k].position, at);
         double d[3] = {at[0], at[1], at[2] - scene->eye.apex + scene->eye.radius};
         double half = scene->sites[k].radius / (2 * (sqrt(sim_dot(d, d)) - 0.9 * scene->eye.radius));
-        gaze.widen[k] = half * half / 2;
+        gaze->widen[k] = half * half / 2;
     }
     for (int s = 0; s < scene->n_sensors; ++s)
-        turn_to_eye(gaze.axes, scene->sensors[s].aim, gaze.sensor_aim[s]);
+        turn_to_eye(gaze->axes, scene->sensors[s].aim, gaze->sensor_aim[s]);
     for (int e = 0; e < scene->n_emitters; ++e)
-        turn_to_eye(gaze.axes, scene->emitters[e].aim, gaze.emitter_aim[e]);
+        turn_to_eye(gaze->axes, scene->emitters[e].aim, gaze->emitter_aim[e]);
+}
+
+static int pose_lids(struct gaze *gaze, double azimuth_deg, double elevation_deg, const double *lid_opening,
+                     int n_lids) {
+    if (n_lids < 1 || n_lids > SIM_MAX_LIDS || !(fabs(azimuth_deg) <= 60 && fabs(elevation_deg) <= 60))
+        return -1;
+    gaze->n_lids = n_lids;
+    for (int i = 0; i < n_lids; ++i) {
+        if (!(lid_opening[i] >= 0 && lid_opening[i] <= 1)) return -1;
+        sim_lid_pose(&gaze->lids[i], &gaze->scene->person, elevation_deg, lid_opening[i]);
+    }
+    return 0;
+}
+
+int sim_scene_glint(const struct sim_scene *scene, double azimuth_deg, double elevation_deg,
+                    const double *lid_opening, int n_lids, double *out) {
+    struct gaze gaze = {.scene = scene, .out = out};
+    if (pose_lids(&gaze, azimuth_deg, elevation_deg, lid_opening, n_lids)) return -1;
+    memset(out, 0, (size_t)(n_lids * scene->n_sensors * scene->n_emitters) * sizeof *out);
+    turn_scene(&gaze, scene, azimuth_deg, elevation_deg);
     for (int a = 0; a < scene->n_sites; ++a)
         for (int b = a; b < scene->n_sites; ++b)
             if (pair_used(scene, a, b)) add_pair(&gaze, a, b);
+    // The counts are all that a scene remembers of being used.
+    for (int i = 0; i < 3; ++i)
+        if (gaze.counts[i]) atomic_fetch_add(&((struct sim_scene *)scene)->glint_counts[i], gaze.counts[i]);
     return 0;
+}
+
+void sim_scene_glint_counts(const struct sim_scene *scene, long long counts[3]) {
+    for (int i = 0; i < 3; ++i) counts[i] = atomic_load(&((struct sim_scene *)scene)->glint_counts[i]);
+}
+
+int sim_scene_mirrors(const struct sim_scene *scene, double azimuth_deg, double elevation_deg,
+                      double lid_opening, int sensor, int emitter, struct sim_mirror_light *out, int most) {
+    enum { ROOM = 32 };
+    struct gaze gaze = {.scene = scene};
+    struct sim_mirror found[ROOM];
+    if (sensor < 0 || sensor >= scene->n_sensors || emitter < 0 || emitter >= scene->n_emitters || most < 1 ||
+        pose_lids(&gaze, azimuth_deg, elevation_deg, &lid_opening, 1))
+        return -1;
+    turn_scene(&gaze, scene, azimuth_deg, elevation_deg);
+    const struct sim_window *at_s = &scene->sensors[sensor], *at_e = &scene->emitters[emitter];
+    struct pair_view view = {.gaze = &gaze, .site_a = at_s->site, .site_b = at_e->site};
+    view.a = gaze.sites[at_s->site];
+    view.b = gaze.sites[at_e->site];
+    int n = sim_mirror_points(&scene->profile, &scene->eye, view.a, view.b, found, most < ROOM ? most : ROOM);
+    for (int i = 0; i < n; ++i) {
+        const struct sim_mirror *m = &found[i];
+        struct sim_mirror_light *light = &out[i];
+        double l[3], v[3], product = m->distance_a * m->distance_b;
+        for (int k = 0; k < 3; ++k) {
+            l[k] = (view.a[k] - m->point[k]) / m->distance_a;
+            v[k] = (view.b[k] - m->point[k]) / m->distance_b;
+            light->point_mm[k] = gaze.axes[3 * k] * m->point[0] + gaze.axes[3 * k + 1] * m->point[1] +
+                                 gaze.axes[3 * k + 2] * m->point[2];
+        }
+        light->theta_deg = m->theta / SIM_RADIANS;
+        light->sensor_mm = m->distance_a;
+        light->emitter_mm = m->distance_b;
+        light->cosine = m->cosine;
+        light->determinant = m->determinant;
+        light->response = sim_fresnel(scene->eye.index, m->cosine) * m->cosine * m->cosine /
+                          (product * product * fabs(m->determinant)) *
+                          window_at(gaze.sensor_aim[sensor], at_s->per_tan2, l) *
+                          window_at(gaze.emitter_aim[emitter], at_e->per_tan2, v);
+        if (m->cosine <= 0 || !openness(&view, m->point, l, v, &light->open)) light->open = 0;
+    }
+    return n;
 }

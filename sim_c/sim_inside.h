@@ -66,6 +66,7 @@ struct sim_scene {
     int gauss_nodes[4];
     const double *rule[SIM_MAX_RULE + 1];  // rule[n]: Gauss-Legendre's n abscissas on -1..1, n weights
     struct sim_profile profile;            // of the eye, for the glint
+    _Atomic long long glint_counts[3];     // see sim_scene_glint_counts()
     double *face_all;    // [sensors][emitters] response of all skin with the lids closed
     double *face_spots;  // [n_lid_spots][sensors + emitters], of what an open eye may replace
     struct sim_lid_spot *lid_spots;  // [n_lid_spots][1 + SIM_SUB]: the spot, then the points after it

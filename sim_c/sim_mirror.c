@@ -166,8 +166,10 @@ static void take_cell(struct scan *scan, const struct node *lo, const struct nod
         last->from = from;
         last->steepest = 0;
         last->crossings = 0;
+        last->closed[0] = fabs(lo->miss) >= scan->reach;
     }
     last->to = to;
+    last->closed[1] = fabs(hi->miss) >= scan->reach;
     double steep = fabs(change) / width;
     if (steep > last->steepest) last->steepest = steep;
     last->crossings += (lo->miss > 0) != (hi->miss > 0);
@@ -218,4 +220,110 @@ int sim_profile_scan(const struct sim_profile *profile, const struct sim_eye *ey
         }
     }
     return scan.n;
+}
+
+// Miss of the ring at theta, found from a starting azimuth that is left at the ring's own.
+static double miss_at(const struct scan *scan, double theta, struct sim_facing *facing) {
+    struct sim_ring ring;
+    sim_ring_at(scan->eye, theta, &ring);
+    sim_ring_face(&ring, scan->a, scan->b, scan->tolerance, facing);
+    return facing->miss;
+}
+
+static void mirror_at(const struct scan *scan, double theta, struct sim_facing *facing,
+                      struct sim_mirror *mirror) {
+    struct sim_ring ring, near[2];
+    double step = 1e-6, to_a[3], to_b[3], flat[2];
+    miss_at(scan, theta, facing);
+    sim_ring_at(scan->eye, theta, &ring);
+    sim_ring_at(scan->eye, theta - step, &near[0]);
+    sim_ring_at(scan->eye, theta + step, &near[1]);
+    double bend = ring.n_up * (near[1].n_out - near[0].n_out) - ring.n_out * (near[1].n_up - near[0].n_up);
+    double across = bend / (2 * step * ring.along), around = ring.r > 1e-4 ? ring.n_out / ring.r : across;
+    const double c = facing->c, s = facing->s;
+    const double along[3] = {ring.n_up * c, ring.n_up * s, -ring.n_out}, turn[3] = {-s, c, 0};
+    mirror->theta = theta;
+    mirror->point[0] = ring.r * c;
+    mirror->point[1] = ring.r * s;
+    mirror->point[2] = ring.z;
+    mirror->normal[0] = ring.n_out * c;
+    mirror->normal[1] = ring.n_out * s;
+    mirror->normal[2] = ring.n_up;
+    for (int k = 0; k < 3; ++k) {
+        to_a[k] = scan->a[k] - mirror->point[k];
+        to_b[k] = scan->b[k] - mirror->point[k];
+    }
+    mirror->distance_a = sqrt(sim_dot(to_a, to_a));
+    mirror->distance_b = sqrt(sim_dot(to_b, to_b));
+    mirror->cosine = sim_dot(to_a, mirror->normal) / mirror->distance_a;
+    flat[0] = sim_dot(to_a, along) / mirror->distance_a;
+    flat[1] = sim_dot(to_a, turn) / mirror->distance_a;
+    // Each leg's length is (1 - u u^T) / distance in its own tangents u, and bends with the surface by its
+    // cosine.
+    double k = 1 / mirror->distance_a + 1 / mirror->distance_b, twice = 2 * mirror->cosine;
+    double h00 = k * (1 - flat[0] * flat[0]) + twice * across, h01 = -k * flat[0] * flat[1];
+    double h11 = k * (1 - flat[1] * flat[1]) + twice * around;
+    mirror->determinant = h00 * h11 - h01 * h01;
+}
+
+// The root between two thetas of which only the first has `up` as the sign of its miss.
+static double root_between(const struct scan *scan, double lo, double hi, struct sim_facing *facing) {
+    double at_lo = miss_at(scan, lo, facing), at_hi = miss_at(scan, hi, facing);
+    for (int i = 0; i < 100 && hi - lo > 1e-14; ++i) {
+        // The secant's point, or the middle where it makes slow progress.
+        double t = at_lo / (at_lo - at_hi);
+        double mid = i % 3 == 2 || !(t > 0 && t < 1) ? (lo + hi) / 2 : lo + t * (hi - lo);
+        double value = miss_at(scan, mid, facing);
+        if (value == 0) return mid;
+        if ((value > 0) == (at_lo > 0)) lo = mid, at_lo = value;
+        else hi = mid, at_hi = value;
+    }
+    return fabs(at_lo) < fabs(at_hi) ? lo : hi;
+}
+
+// Where |miss| is least between two thetas, unless its sign changes on the way there.
+static double least_between(const struct scan *scan, double lo, double hi, struct sim_facing *facing) {
+    int sign = miss_at(scan, lo, facing) > 0;
+    for (int i = 0; i < 60; ++i) {
+        double a = lo + 0.382 * (hi - lo), b = lo + 0.618 * (hi - lo);
+        double at_a = miss_at(scan, a, facing), at_b = miss_at(scan, b, facing);
+        if ((at_a > 0) != sign) return a;
+        if ((at_b > 0) != sign) return b;
+        if (fabs(at_a) < fabs(at_b)) hi = b;
+        else lo = a;
+    }
+    return (lo + hi) / 2;
+}
+
+int sim_mirror_points(const struct sim_profile *profile, const struct sim_eye *eye, const double a[3],
+                      const double b[3], struct sim_mirror *out, int most) {
+    enum { CELLS = 16 };
+    struct sim_stretch stretches[SIM_STRETCHES];
+    struct scan scan = {.eye = eye, .a = a, .b = b, .tolerance = 1e-9};
+    struct sim_facing facing;
+    sim_facing_start(a, b, &facing);
+    int found = 0, n = sim_profile_scan(profile, eye, a, b, 1e-3, stretches);
+    if (miss_at(&scan, 0, &facing) <= 0 && most > 0) mirror_at(&scan, 0, &facing, &out[found++]);
+    for (int i = 0; i < n; ++i) {
+        double from = stretches[i].from, step = (stretches[i].to - from) / CELLS, value[CELLS + 1];
+        for (int j = 0; j <= CELLS; ++j) value[j] = miss_at(&scan, from + j * step, &facing);
+        if (from == 0 && value[0] == 0) value[0] = value[1];  // counted above
+        for (int j = 0; j < CELLS; ++j) {
+            double lo = from + j * step, hi = lo + step, ends[3] = {lo, hi, hi};
+            if ((value[j] > 0) == (value[j + 1] > 0)) {
+                // Two roots may hide on both sides of a node that is nearer to zero than its neighbours.
+                int dips = j > 0 && fabs(value[j]) <= fabs(value[j + 1]) &&
+                           fabs(value[j]) <= fabs(value[j - 1]) && (value[j - 1] > 0) == (value[j] > 0);
+                if (!dips) continue;
+                ends[0] = lo - step;
+                ends[1] = least_between(&scan, ends[0], hi, &facing);
+                if ((miss_at(&scan, ends[1], &facing) > 0) == (value[j] > 0)) continue;
+            }
+            for (int k = 0; k < 2 && ends[k + 1] > ends[k]; ++k) {
+                if (found == most) return found;
+                mirror_at(&scan, root_between(&scan, ends[k], ends[k + 1], &facing), &facing, &out[found++]);
+            }
+        }
+    }
+    return found;
 }

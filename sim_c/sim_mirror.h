@@ -38,11 +38,20 @@ struct sim_facing {
     double nearest;  // distance of the nearer site
 };
 
+// A point that mirrors one site into the other.
+struct sim_mirror {
+    double theta, point[3], normal[3];
+    double distance_a, distance_b, cosine;  // of incidence
+    double determinant;  // of the second derivatives of |a - p| + |p - b| in the tangent plane, 1/mm^2: < 0 at
+                         // a saddle
+};
+
 // Part of the profile where the miss is within reach.
 struct sim_stretch {
     double from, to;    // theta
     double steepest;    // largest |d sine of miss / d theta| in it
-    int crossings;      // roots of the miss in it
+    int crossings;      // changes of the miss' sign seen in it
+    int closed[2];      // whether the miss is out of reach at either end
 };
 
 void sim_ring_at(const struct sim_eye *eye, double theta, struct sim_ring *ring);
@@ -61,5 +70,10 @@ void sim_facing_start(const double a[3], const double b[3], struct sim_facing *f
 // dip within reach between them. Returns their number, at most SIM_STRETCHES.
 int sim_profile_scan(const struct sim_profile *profile, const struct sim_eye *eye, const double a[3],
                      const double b[3], double reach, struct sim_stretch *out);
+
+// All mirror points, from the axis outward; at most `most`. Returns their number: odd, and one more of them
+// with a positive determinant than with a negative one.
+int sim_mirror_points(const struct sim_profile *profile, const struct sim_eye *eye, const double a[3],
+                      const double b[3], struct sim_mirror *out, int most);
 
 #endif
