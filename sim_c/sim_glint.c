@@ -12,33 +12,12 @@
 #include <stdatomic.h>
 #include <string.h>
 
-#include "sim_inside.h"
+#include "sim_glint.h"
 
 #define PI 3.14159265358979323846
 enum { FEWEST = 3, ARCS = 2 };
 
-// Of one gaze.
-struct gaze {
-    const struct sim_scene *scene;
-    double axes[9], sites[2 * SIM_MAX_PORTS][3], widen[2 * SIM_MAX_PORTS];
-    double sensor_aim[SIM_MAX_PORTS][3], emitter_aim[SIM_MAX_PORTS][3];
-    struct sim_lid lids[SIM_MAX_LIDS];
-    int n_lids;
-    double *out;
-    long long counts[3];  // as sim_scene_glint_counts()
-};
-
-// Of one pair of sites.
-struct pair_view {
-    const struct gaze *gaze;
-    const double *a, *b;  // site positions, eye frame
-    int site_a, site_b;
-    double alpha, alpha2, cut;  // cut: slope^2 / alpha^2 beyond which nothing is taken
-    double near;                // how closely a ring's centre must be found, in slope
-    struct sim_facing start;
-};
-
-static double window_at(const double aim[3], double per_tan2, const double away[3]) {
+double sim_gaze_window(const double aim[3], double per_tan2, const double away[3]) {
     double c = -sim_dot(aim, away);
     if (c < 0.03) return 0;
     double t = (1 - c * c) / (c * c) * per_tan2;
@@ -46,9 +25,9 @@ static double window_at(const double aim[3], double per_tan2, const double away[
 }
 
 // The lids' and the face's share of a point: open[lid]. Returns whether anything is left.
-static int openness(const struct pair_view *view, const double point[3], const double l[3], const double v[3],
+int sim_lobe_open(const struct sim_lobe *lobe, const double point[3], const double l[3], const double v[3],
                     double *open) {
-    const struct gaze *gaze = view->gaze;
+    const struct sim_gaze *gaze = lobe->gaze;
     const double *axes = gaze->axes;
     double head[3], away[2][3], alpha, beta;
     for (int i = 0; i < 3; ++i) {
@@ -66,41 +45,44 @@ static int openness(const struct pair_view *view, const double point[3], const d
     }
     if (any == 0) return 0;
     const struct sim_face *face = &gaze->scene->face;
-    double reach = sim_face_eye_reach(face, view->site_a, alpha, beta);
-    if (reach > 0) reach *= sim_face_eye_reach(face, view->site_b, alpha, beta);
+    double reach = sim_face_eye_reach(face, lobe->site_a, alpha, beta);
+    if (reach > 0) reach *= sim_face_eye_reach(face, lobe->site_b, alpha, beta);
     for (int i = 0; i < gaze->n_lids; ++i) open[i] *= reach;
     return reach > 0;
 }
 
 // Adds weight times all that varies with the ports.
-static void add_ports(const struct pair_view *view, double weight, const double l[3], const double v[3],
+static void add_ports(const struct sim_lobe *lobe, double weight, const double l[3], const double v[3],
                       const double *open) {
-    const struct gaze *gaze = view->gaze;
+    const struct sim_gaze *gaze = lobe->gaze;
     const struct sim_scene *scene = gaze->scene;
     int m = scene->n_emitters, pairs = scene->n_sensors * m;
+    double *apart = lobe->apart;
     for (int s = 0; s < scene->n_sensors; ++s) {
-        int site = scene->sensors[s].site, here = site == view->site_a;
-        if (!here && site != view->site_b) continue;
-        double ws = window_at(gaze->sensor_aim[s], scene->sensors[s].per_tan2, here ? l : v);
-        if (ws == 0) continue;
+        int site = scene->sensors[s].site, here = site == lobe->site_a;
+        if (!here && site != lobe->site_b) continue;
+        double ws = sim_gaze_window(gaze->sensor_aim[s], scene->sensors[s].per_tan2, here ? l : v);
+        if (ws == 0 && !apart) continue;
         for (int e = 0; e < m; ++e) {
             // A pair belongs to this view when its two ends are the view's two sites.
-            if (scene->emitters[e].site != (here ? view->site_b : view->site_a)) continue;
-            double w = window_at(gaze->emitter_aim[e], scene->emitters[e].per_tan2, here ? v : l);
+            if (scene->emitters[e].site != (here ? lobe->site_b : lobe->site_a)) continue;
+            double w = sim_gaze_window(gaze->emitter_aim[e], scene->emitters[e].per_tan2, here ? v : l);
             w *= ws * weight;
-            for (int i = 0; i < gaze->n_lids; ++i) gaze->out[i * pairs + s * m + e] += w * open[i];
+            double *to = apart ? apart : gaze->out + s * m + e;
+            for (int i = 0; i < gaze->n_lids; ++i) to[apart ? i : i * pairs] += w * open[i];
+            if (apart) apart += gaze->n_lids;
         }
     }
 }
 
 // Adds the integrand at an azimuth (cosine, sine). Returns slope^2 / alpha^2 there, large behind a horizon.
-static double add_point(const struct pair_view *view, const struct sim_ring *ring, double c, double s,
+double sim_lobe_point(const struct sim_lobe *lobe, const struct sim_ring *ring, double c, double s,
                         double weight) {
     double point[3] = {ring->r * c, ring->r * s, ring->z}, l[3], v[3], h[3];
     double normal[3] = {ring->n_out * c, ring->n_out * s, ring->n_up};
     for (int k = 0; k < 3; ++k) {
-        l[k] = view->a[k] - point[k];
-        v[k] = view->b[k] - point[k];
+        l[k] = lobe->a[k] - point[k];
+        v[k] = lobe->b[k] - point[k];
     }
     double da2 = sim_dot(l, l), db2 = sim_dot(v, v), ka = 1 / sqrt(da2), kb = 1 / sqrt(db2);
     for (int k = 0; k < 3; ++k) {
@@ -112,13 +94,13 @@ static double add_point(const struct pair_view *view, const struct sim_ring *rin
     // |n x h|^2 / (n.h)^2 without the cancellation of 1 - cos^2.
     double x[3] = {normal[1] * h[2] - normal[2] * h[1], normal[2] * h[0] - normal[0] * h[2],
                    normal[0] * h[1] - normal[1] * h[0]};
-    double slope2 = hn > 0 ? sim_dot(x, x) / (hn * hn * view->alpha2) : 1e30;
-    if (slope2 > view->cut || nl <= 0 || nv <= 0) return slope2;
+    double slope2 = hn > 0 ? sim_dot(x, x) / (hn * hn * lobe->alpha2) : 1e30;
+    if (slope2 > lobe->cut || nl <= 0 || nv <= 0) return slope2;
     double open[SIM_MAX_LIDS];
-    if (!openness(view, point, l, v, open)) return slope2;
-    double c2 = hn * hn / h2, lobe = exp(-slope2) / (PI * view->alpha2 * c2 * c2);
-    weight *= lobe * sim_fresnel(view->gaze->scene->eye.index, sqrt(h2) / 2) / (4 * da2 * db2);
-    add_ports(view, weight, l, v, open);
+    if (!sim_lobe_open(lobe, point, l, v, open)) return slope2;
+    double c2 = hn * hn / h2, peak = exp(-slope2) / (PI * lobe->alpha2 * c2 * c2);
+    weight *= peak * sim_fresnel(lobe->gaze->scene->eye.index, sqrt(h2) / 2) / (4 * da2 * db2);
+    add_ports(lobe, weight, l, v, open);
     return slope2;
 }
 
@@ -131,9 +113,9 @@ static double arc_seen(const struct sim_ring *ring, const double site[3]) {
 }
 
 // The arcs of a ring that see both sites: [from, to] pairs. Returns their number.
-static int arcs_seen(const struct pair_view *view, const struct sim_ring *ring, double arcs[ARCS][2]) {
-    double wa = arc_seen(ring, view->a), wb = arc_seen(ring, view->b);
-    double at = atan2(view->a[1], view->a[0]), off = atan2(view->b[1], view->b[0]) - at;
+static int arcs_seen(const struct sim_lobe *lobe, const struct sim_ring *ring, double arcs[ARCS][2]) {
+    double wa = arc_seen(ring, lobe->a), wb = arc_seen(ring, lobe->b);
+    double at = atan2(lobe->a[1], lobe->a[0]), off = atan2(lobe->b[1], lobe->b[0]) - at;
     off -= 2 * PI * floor(off / (2 * PI) + 0.5);
     int n = 0;
     for (int turn = -1; turn <= 1; ++turn) {
@@ -153,10 +135,10 @@ static int panel_points(const struct sim_scene *scene, double widths) {
     return n < FEWEST ? FEWEST : n > SIM_MAX_RULE ? SIM_MAX_RULE : n;
 }
 
-static void add_arcs(const struct pair_view *view, const struct sim_ring *ring, double step, double weight) {
-    const struct sim_scene *scene = view->gaze->scene;
+static void add_arcs(const struct sim_lobe *lobe, const struct sim_ring *ring, double step, double weight) {
+    const struct sim_scene *scene = lobe->gaze->scene;
     double arcs[ARCS][2];
-    int n = arcs_seen(view, ring, arcs);
+    int n = arcs_seen(lobe, ring, arcs);
     for (int i = 0; i < n; ++i) {
         double width = arcs[i][1] - arcs[i][0], widths = width / step;
         int panels = (int)ceil(widths / 5), points = panel_points(scene, widths / panels);
@@ -164,16 +146,16 @@ static void add_arcs(const struct pair_view *view, const struct sim_ring *ring, 
         for (int j = 0; j < panels * points; ++j) {
             double half = width / (2 * panels);
             double phi = arcs[i][0] + half * (2 * (j / points) + 1 + x[j % points]);
-            add_point(view, ring, cos(phi), sin(phi), weight * half * w[j % points]);
+            sim_lobe_point(lobe, ring, cos(phi), sin(phi), weight * half * w[j % points]);
         }
     }
 }
 
 // Adds points of equal steps from an azimuth to both sides, steps low..high; stops, if it may, where the lobe
 // is out of reach and getting further. On return low..high are the steps taken.
-static void march(const struct pair_view *view, const struct sim_ring *ring, const struct sim_facing *at,
+static void march(const struct sim_lobe *lobe, const struct sim_ring *ring, const struct sim_facing *at,
                   double step, int may_stop, double weight, int *low, int *high) {
-    double cs = cos(step), sn = sin(step), middle = add_point(view, ring, at->c, at->s, weight);
+    double cs = cos(step), sn = sin(step), middle = sim_lobe_point(lobe, ring, at->c, at->s, weight);
     for (int side = -1; side <= 1; side += 2) {
         double c = at->c, s = at->s, before = middle;
         int last = side < 0 ? -*low : *high;
@@ -181,8 +163,8 @@ static void march(const struct pair_view *view, const struct sim_ring *ring, con
             double turned = c * cs - side * s * sn;
             s = s * cs + side * c * sn;
             c = turned;
-            double now = add_point(view, ring, c, s, weight);
-            if (may_stop && now > view->cut && now >= before) {
+            double now = sim_lobe_point(lobe, ring, c, s, weight);
+            if (may_stop && now > lobe->cut && now >= before) {
                 *(side < 0 ? low : high) = side * j;
                 break;
             }
@@ -191,22 +173,22 @@ static void march(const struct pair_view *view, const struct sim_ring *ring, con
     }
 }
 
-static void add_ring(struct pair_view *view, double theta, double weight) {
-    const struct sim_scene *scene = view->gaze->scene;
+static void add_ring(struct sim_lobe *lobe, double theta, double weight) {
+    const struct sim_scene *scene = lobe->gaze->scene;
     struct sim_ring ring;
     sim_ring_at(&scene->eye, theta, &ring);
-    sim_ring_face(&ring, view->a, view->b, view->near, &view->start);
-    const struct sim_facing *at = &view->start;
-    double reach = sqrt(view->cut) * view->alpha;
+    sim_ring_face(&ring, lobe->a, lobe->b, lobe->near, &lobe->start);
+    const struct sim_facing *at = &lobe->start;
+    double reach = sqrt(lobe->cut) * lobe->alpha;
     if (fabs(at->miss) > 1.3 * reach) return;
     weight *= ring.area;
     // Round the axis the lobe lies across the ring, and the slope is nowhere steep but turns.
     int axial = at->pace < 6 * reach;
-    double width = view->alpha / (at->pace + axial * fabs(at->miss) + 1e-9), most = 0.6 / (ring.r + 1e-9);
+    double width = lobe->alpha / (at->pace + axial * fabs(at->miss) + 1e-9), most = 0.6 / (ring.r + 1e-9);
     if (width > most) width = most;
     double sine = sqrt(fmax(0, 1 - at->cosine * at->cosine));
     if (at->cosine < 2 * reach * sine) {
-        add_arcs(view, &ring, width, weight);
+        add_arcs(lobe, &ring, width, weight);
         return;
     }
     int n = (int)ceil(2 * PI / (0.9 * width) * sqrt(scene->quality.glint));
@@ -214,15 +196,15 @@ static void add_ring(struct pair_view *view, double theta, double weight) {
     double step = 2 * PI / n;
     int low = -((n - 1) / 2), high = n / 2;
     if (n <= 48) {
-        march(view, &ring, at, step, 0, weight * step, &low, &high);
+        march(lobe, &ring, at, step, 0, weight * step, &low, &high);
         return;
     }
     int covered[2] = {low, high};
-    march(view, &ring, at, step, 1, weight * step, &covered[0], &covered[1]);
+    march(lobe, &ring, at, step, 1, weight * step, &covered[0], &covered[1]);
     if (!axial) return;
     // A second azimuth may be as near.
     struct sim_facing other = {.c = -at->c, .s = -at->s};
-    sim_ring_face(&ring, view->a, view->b, view->near, &other);
+    sim_ring_face(&ring, lobe->a, lobe->b, lobe->near, &other);
     double angle = atan2(other.s * at->c - other.c * at->s, other.c * at->c + other.s * at->s);
     int index = (int)floor(angle / step + 0.5), from = covered[1] + 1, to = covered[0] - 1 + n;
     if (index < covered[0]) index += n;
@@ -231,66 +213,67 @@ static void add_ring(struct pair_view *view, double theta, double weight) {
     other.s = at->s * cos(index * step) + at->c * sin(index * step);
     low = from - index;
     high = to - index;
-    march(view, &ring, &other, step, 1, weight * step, &low, &high);
+    march(lobe, &ring, &other, step, 1, weight * step, &low, &high);
 }
 
 // How a ring is seen: changes where an arc appears or closes, which is where panels must end.
-static int arcs_kind(const struct pair_view *view, double theta) {
+static int arcs_kind(const struct sim_lobe *lobe, double theta) {
     struct sim_ring ring;
     double arcs[ARCS][2];
-    sim_ring_at(&view->gaze->scene->eye, theta, &ring);
-    int full = 4 * (arc_seen(&ring, view->a) >= PI) + 8 * (arc_seen(&ring, view->b) >= PI);
-    return full + arcs_seen(view, &ring, arcs);
+    sim_ring_at(&lobe->gaze->scene->eye, theta, &ring);
+    int full = 4 * (arc_seen(&ring, lobe->a) >= PI) + 8 * (arc_seen(&ring, lobe->b) >= PI);
+    return full + arcs_seen(lobe, &ring, arcs);
 }
 
-static void add_panels(struct pair_view *view, double from, double to, double steepest) {
-    const struct sim_scene *scene = view->gaze->scene;
-    double widths = (to - from) * steepest / view->alpha, length = (to - from) * scene->eye.apex;
+static void add_panels(struct sim_lobe *lobe, double from, double to, double steepest) {
+    const struct sim_scene *scene = lobe->gaze->scene;
+    double widths = (to - from) * steepest / lobe->alpha, length = (to - from) * scene->eye.apex;
     int panels = (int)ceil(fmax(widths / 12, length / 4));
     if (panels < 1) panels = 1;
     int points = panel_points(scene, fmax(widths, length / 0.6) / panels);
     const double *x = scene->rule[points], *w = x + points;
     double half = (to - from) / (2 * panels);
     for (int j = 0; j < panels * points; ++j)
-        add_ring(view, from + half * (2 * (j / points) + 1 + x[j % points]), half * w[j % points]);
+        add_ring(lobe, from + half * (2 * (j / points) + 1 + x[j % points]), half * w[j % points]);
 }
 
-static void add_stretch(struct pair_view *view, const struct sim_stretch *stretch) {
-    double reach = sqrt(view->cut) * view->alpha, from = stretch->from;
+static void add_stretch(struct sim_lobe *lobe, const struct sim_stretch *stretch) {
+    double reach = sqrt(lobe->cut) * lobe->alpha, from = stretch->from;
     // A lobe too narrow to reach any horizon but in grazing light: no arc opens or closes in it that matters.
     int pieces = reach > 0.3 ? (int)ceil((stretch->to - stretch->from) / 0.04) : 0;
     for (int i = 0; i < pieces; ++i) {
         double lo = stretch->from + (stretch->to - stretch->from) * i / pieces;
         double hi = stretch->from + (stretch->to - stretch->from) * (i + 1) / pieces;
-        int kind = arcs_kind(view, lo);
-        if (arcs_kind(view, hi) == kind) continue;
+        int kind = arcs_kind(lobe, lo);
+        if (arcs_kind(lobe, hi) == kind) continue;
         for (int j = 0; j < 40; ++j) {
             double mid = (lo + hi) / 2;
-            if (arcs_kind(view, mid) == kind) lo = mid;
+            if (arcs_kind(lobe, mid) == kind) lo = mid;
             else hi = mid;
         }
-        add_panels(view, from, lo, stretch->steepest);
+        add_panels(lobe, from, lo, stretch->steepest);
         from = lo;
     }
-    add_panels(view, from, stretch->to, stretch->steepest);
+    add_panels(lobe, from, stretch->to, stretch->steepest);
 }
 
-static void add_pair(struct gaze *gaze, int a, int b) {
+static void add_pair(struct sim_gaze *gaze, int a, int b) {
     const struct sim_scene *scene = gaze->scene;
     double rough = scene->person.roughness, fine = log(scene->quality.glint);
-    struct pair_view view = {.gaze = gaze, .a = gaze->sites[a], .b = gaze->sites[b], .site_a = a, .site_b = b};
-    view.alpha2 = rough * rough + gaze->widen[a] + gaze->widen[b];
-    view.alpha = sqrt(view.alpha2);
-    view.cut = fmin(fmax(11 + 6 * fine, 5), 30);
-    view.near = fmin(0.3 * view.alpha, 0.03);
-    sim_facing_start(view.a, view.b, &view.start);
+    struct sim_lobe lobe = {.gaze = gaze, .a = gaze->sites[a], .b = gaze->sites[b], .site_a = a, .site_b = b};
+    lobe.alpha2 = rough * rough + gaze->widen[a] + gaze->widen[b];
+    lobe.alpha = sqrt(lobe.alpha2);
+    lobe.cut = fmin(fmax(11 + 6 * fine, 5), 30);
+    lobe.near = fmin(0.3 * lobe.alpha, 0.03);
+    sim_facing_start(lobe.a, lobe.b, &lobe.start);
     struct sim_stretch stretches[SIM_STRETCHES];
-    double reach = sqrt(view.cut) * view.alpha;
+    double reach = sqrt(lobe.cut) * lobe.alpha;
     // Of a wide lobe the linear miss is but an estimate.
-    int n = sim_profile_scan(&scene->profile, &scene->eye, view.a, view.b, reach * (1 + fmin(reach, 0.2)),
+    int n = sim_profile_scan(&scene->profile, &scene->eye, lobe.a, lobe.b, reach * (1 + fmin(reach, 0.2)),
                              stretches);
-    for (int i = 0; i < n; ++i) add_stretch(&view, &stretches[i]);
-    ++gaze->counts[n ? 1 : 2];
+    int cheap = n && scene->quality.tolerance > 0 && sim_lobe_by_mirror(&lobe, stretches, n);
+    ++gaze->counts[cheap ? 0 : n ? 1 : 2];
+    for (int i = 0; i < n && !cheap; ++i) add_stretch(&lobe, &stretches[i]);
 }
 
 static int pair_used(const struct sim_scene *scene, int a, int b) {
@@ -306,10 +289,16 @@ static void turn_to_eye(const double axes[9], const double head[3], double eye[3
     for (int j = 0; j < 3; ++j) eye[j] = axes[j] * head[0] + axes[3 + j] * head[1] + axes[6 + j] * head[2];
 }
 
-// The eye frame's part of a gaze.
-static void turn_scene(struct gaze *gaze, const struct sim_scene *scene, double azimuth_deg,
-                       double elevation_deg) {
+int sim_gaze_open(struct sim_gaze *gaze, const struct sim_scene *scene, double azimuth_deg,
+                  double elevation_deg, const double *lid_opening, int n_lids) {
+    if (n_lids < 1 || n_lids > SIM_MAX_LIDS || !(fabs(azimuth_deg) <= 60 && fabs(elevation_deg) <= 60))
+        return -1;
     gaze->scene = scene;
+    gaze->n_lids = n_lids;
+    for (int i = 0; i < n_lids; ++i) {
+        if (!(lid_opening[i] >= 0 && lid_opening[i] <= 1)) return -1;
+        sim_lid_pose(&gaze->lids[i], &scene->person, elevation_deg, lid_opening[i]);
+    }
     sim_eye_orient(&scene->eye, azimuth_deg, elevation_deg, gaze->axes);
     for (int k = 0; k < scene->n_sites; ++k) {
         double *at = gaze->sites[k];
@@ -322,26 +311,16 @@ static void turn_scene(struct gaze *gaze, const struct sim_scene *scene, double 
         turn_to_eye(gaze->axes, scene->sensors[s].aim, gaze->sensor_aim[s]);
     for (int e = 0; e < scene->n_emitters; ++e)
         turn_to_eye(gaze->axes, scene->emitters[e].aim, gaze->emitter_aim[e]);
-}
-
-static int pose_lids(struct gaze *gaze, double azimuth_deg, double elevation_deg, const double *lid_opening,
-                     int n_lids) {
-    if (n_lids < 1 || n_lids > SIM_MAX_LIDS || !(fabs(azimuth_deg) <= 60 && fabs(elevation_deg) <= 60))
-        return -1;
-    gaze->n_lids = n_lids;
-    for (int i = 0; i < n_lids; ++i) {
-        if (!(lid_opening[i] >= 0 && lid_opening[i] <= 1)) return -1;
-        sim_lid_pose(&gaze->lids[i], &gaze->scene->person, elevation_deg, lid_opening[i]);
-    }
     return 0;
 }
 
 int sim_scene_glint(const struct sim_scene *scene, double azimuth_deg, double elevation_deg,
                     const double *lid_opening, int n_lids, double *out) {
-    struct gaze gaze = {.scene = scene, .out = out};
-    if (pose_lids(&gaze, azimuth_deg, elevation_deg, lid_opening, n_lids)) return -1;
+    struct sim_gaze gaze;
+    if (sim_gaze_open(&gaze, scene, azimuth_deg, elevation_deg, lid_opening, n_lids)) return -1;
+    gaze.out = out;
+    memset(gaze.counts, 0, sizeof gaze.counts);
     memset(out, 0, (size_t)(n_lids * scene->n_sensors * scene->n_emitters) * sizeof *out);
-    turn_scene(&gaze, scene, azimuth_deg, elevation_deg);
     for (int a = 0; a < scene->n_sites; ++a)
         for (int b = a; b < scene->n_sites; ++b)
             if (pair_used(scene, a, b)) add_pair(&gaze, a, b);
@@ -353,42 +332,4 @@ int sim_scene_glint(const struct sim_scene *scene, double azimuth_deg, double el
 
 void sim_scene_glint_counts(const struct sim_scene *scene, long long counts[3]) {
     for (int i = 0; i < 3; ++i) counts[i] = atomic_load(&((struct sim_scene *)scene)->glint_counts[i]);
-}
-
-int sim_scene_mirrors(const struct sim_scene *scene, double azimuth_deg, double elevation_deg,
-                      double lid_opening, int sensor, int emitter, struct sim_mirror_light *out, int most) {
-    enum { ROOM = 32 };
-    struct gaze gaze = {.scene = scene};
-    struct sim_mirror found[ROOM];
-    if (sensor < 0 || sensor >= scene->n_sensors || emitter < 0 || emitter >= scene->n_emitters || most < 1 ||
-        pose_lids(&gaze, azimuth_deg, elevation_deg, &lid_opening, 1))
-        return -1;
-    turn_scene(&gaze, scene, azimuth_deg, elevation_deg);
-    const struct sim_window *at_s = &scene->sensors[sensor], *at_e = &scene->emitters[emitter];
-    struct pair_view view = {.gaze = &gaze, .site_a = at_s->site, .site_b = at_e->site};
-    view.a = gaze.sites[at_s->site];
-    view.b = gaze.sites[at_e->site];
-    int n = sim_mirror_points(&scene->profile, &scene->eye, view.a, view.b, found, most < ROOM ? most : ROOM);
-    for (int i = 0; i < n; ++i) {
-        const struct sim_mirror *m = &found[i];
-        struct sim_mirror_light *light = &out[i];
-        double l[3], v[3], product = m->distance_a * m->distance_b;
-        for (int k = 0; k < 3; ++k) {
-            l[k] = (view.a[k] - m->point[k]) / m->distance_a;
-            v[k] = (view.b[k] - m->point[k]) / m->distance_b;
-            light->point_mm[k] = gaze.axes[3 * k] * m->point[0] + gaze.axes[3 * k + 1] * m->point[1] +
-                                 gaze.axes[3 * k + 2] * m->point[2];
-        }
-        light->theta_deg = m->theta / SIM_RADIANS;
-        light->sensor_mm = m->distance_a;
-        light->emitter_mm = m->distance_b;
-        light->cosine = m->cosine;
-        light->determinant = m->determinant;
-        light->response = sim_fresnel(scene->eye.index, m->cosine) * m->cosine * m->cosine /
-                          (product * product * fabs(m->determinant)) *
-                          window_at(gaze.sensor_aim[sensor], at_s->per_tan2, l) *
-                          window_at(gaze.emitter_aim[emitter], at_e->per_tan2, v);
-        if (m->cosine <= 0 || !openness(&view, m->point, l, v, &light->open)) light->open = 0;
-    }
-    return n;
 }

@@ -295,6 +295,24 @@ static double least_between(const struct scan *scan, double lo, double hi, struc
     return (lo + hi) / 2;
 }
 
+double sim_mirror_root(const struct sim_eye *eye, const double a[3], const double b[3], double from, double to,
+                       double tolerance, struct sim_facing *facing, double *slope) {
+    struct scan scan = {.eye = eye, .a = a, .b = b, .tolerance = 3 * tolerance};
+    double at_from = miss_at(&scan, from, facing), at_to = miss_at(&scan, to, facing), mid = from;
+    for (int i = 0; i < 60; ++i) {
+        double t = at_from / (at_from - at_to);
+        mid = i % 4 == 3 || !(t > 0 && t < 1) ? (from + to) / 2 : from + t * (to - from);
+        double value = miss_at(&scan, mid, facing);
+        if (fabs(value) < tolerance) break;
+        if ((value > 0) == (at_from > 0)) from = mid, at_from = value;
+        else to = mid, at_to = value;
+    }
+    struct sim_facing beside = *facing;
+    double step = 1e-5, above = miss_at(&scan, mid + step, &beside);
+    *slope = (above - miss_at(&scan, mid - step, &beside)) / (2 * step);
+    return mid;
+}
+
 int sim_mirror_points(const struct sim_profile *profile, const struct sim_eye *eye, const double a[3],
                       const double b[3], struct sim_mirror *out, int most) {
     enum { CELLS = 16 };

@@ -71,6 +71,11 @@ void sim_facing_start(const double a[3], const double b[3], struct sim_facing *f
 int sim_profile_scan(const struct sim_profile *profile, const struct sim_eye *eye, const double a[3],
                      const double b[3], double reach, struct sim_stretch *out);
 
+// The root of the miss between two thetas of opposite sign, to a tolerance of the miss; facing is where to start
+// and receives its azimuth, slope d miss / d theta.
+double sim_mirror_root(const struct sim_eye *eye, const double a[3], const double b[3], double from, double to,
+                       double tolerance, struct sim_facing *facing, double *slope);
+
 // All mirror points, from the axis outward; at most `most`. Returns their number: odd, and one more of them
 // with a positive determinant than with a negative one.
 int sim_mirror_points(const struct sim_profile *profile, const struct sim_eye *eye, const double a[3],

@@ -26,6 +26,7 @@ SOURCES = (
     "sim_diffuse.c",
     "sim_mirror.c",
     "sim_glint.c",
+    "sim_glint_mirror.c",
     "sim_scene.c",
     "sim_image.c",
     "sim_image_face.c",
