@@ -3,17 +3,21 @@
 // The glint from mirror points: for checks, and in place of the lobe's quadrature where that is good enough.
 //
 // Round a mirror point the slope is nearly linear in the place, so the lobe is nearly a Gaussian there. What
-// multiplies it (spreading, Fresnel, windows) is sampled by Gauss-Hermite's three points each way. The middle
-// one alone is the mirror point's response; what the neighbours change along each direction, relative to the
-// whole, is of the order alpha^2, and its square times the whole is an estimate of what three points leave out.
+// multiplies it (spreading, Fresnel, windows) is sampled by Gauss-Hermite's five points each way. The middle
+// one alone is the mirror point's response; what the neighbours change along each direction is of the order
+// alpha^2. A part of that, and all of it where it is no small part of the whole, is the estimate of what is
+// left out of a result that includes the neighbours.
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
 
 #include "sim_glint.h"
 
 #define PI 3.14159265358979323846
 enum { MOST_VALUES = 64, RULES = 4 };
-static const double NODE = 1.22474487139158904910;  // sqrt(3/2)
+// Gauss-Hermite's five points, weights over sqrt(PI).
+static const double NODE[3] = {0, 0.95857246461381850711, 2.02018287045608563293};
+static const double SHARE[3] = {8 / 15.0, 0.22207592200561264, 0.011257411327720689};
 
 // Where a lobe is seen through: least and greatest openness of each lid pose over the points looked at.
 struct shade {
@@ -40,38 +44,36 @@ static void look_through(const struct sim_lobe *lobe, const struct sim_ring *rin
     }
 }
 
-// Three by three points round the mirror point at theta. sum: [rule][value], the rules having 1 x 1, 3 x 1,
-// 1 x 3 and 3 x 3 points along the profile and around. Returns 0 where the estimate would not hold.
+// Five by five points round the mirror point at theta. sum: [rule][value], the rules having 1 x 1, 5 x 1,
+// 1 x 5 and 5 x 5 points along the profile and around. Returns 0 where the estimate would not hold.
 static int sample(struct sim_lobe *lobe, double theta, double slope, const struct sim_facing *middle,
                   double (*sum)[MOST_VALUES], int values) {
     const struct sim_eye *eye = &lobe->gaze->scene->eye;
     struct shade shade;
     double reach = sqrt(lobe->cut);
     for (int i = 0; i < lobe->gaze->n_lids; ++i) shade.least[i] = 1, shade.most[i] = 0;
-    for (int i = -2; i <= 2; ++i) {
-        int outer = i == -2 || i == 2;
-        double x = outer ? i / 2 * reach : i * NODE;
+    for (int i = -3; i <= 3; ++i) {
+        int outer = abs(i) == 3;  // looked through only
+        double x = outer ? i / 3 * reach : i < 0 ? -NODE[-i] : NODE[i];
         struct sim_ring ring;
         struct sim_facing at = *middle;
         sim_ring_at(eye, theta + lobe->alpha * x / slope, &ring);
         sim_ring_face(&ring, lobe->a, lobe->b, 0.02 * lobe->alpha, &at);
         double width = lobe->alpha / at.pace, sine = sqrt(fmax(0, 1 - at.cosine * at.cosine));
         if (width * reach > 0.7 || at.cosine < 2 * reach * lobe->alpha * sine) return 0;
-        if (outer) {
-            look_through(lobe, &ring, at.c, at.s, &shade);
-            continue;
-        }
-        for (int j = -2; j <= 2; ++j) {
-            int edge = j == -2 || j == 2;
+        for (int j = outer ? 0 : -3; j <= (outer ? 0 : 3); ++j) {
+            int edge = abs(j) == 3;
             if (edge && i) continue;
-            double y = edge ? j / 2 * reach : j * NODE, cy = cos(width * y), sy = sin(width * y);
-            double c = at.c * cy - at.s * sy, s = at.s * cy + at.c * sy, one[MOST_VALUES] = {0};
-            look_through(lobe, &ring, c, s, &shade);
-            if (edge) continue;
+            double y = edge ? j / 3 * reach : j < 0 ? -NODE[-j] : NODE[j];
+            double cy = cos(width * y), sy = sin(width * y), one[MOST_VALUES] = {0};
+            double c = at.c * cy - at.s * sy, s = at.s * cy + at.c * sy;
+            if (outer || edge || !i || !j) look_through(lobe, &ring, c, s, &shade);
+            if (outer || edge) continue;
+            double weight = PI * exp(x * x + y * y) * ring.area * width * lobe->alpha / slope;
             lobe->apart = one;
-            sim_lobe_point(lobe, &ring, c, s, PI * exp(x * x + y * y) * ring.area * width * lobe->alpha / slope);
+            sim_lobe_point(lobe, &ring, c, s, weight);
             lobe->apart = NULL;
-            double wx = i ? 1 / 6.0 : 2 / 3.0, wy = j ? 1 / 6.0 : 2 / 3.0;
+            double wx = SHARE[abs(i)], wy = SHARE[abs(j)];
             for (int k = 0; k < values; ++k) {
                 sum[0][k] += !i && !j ? one[k] : 0;
                 sum[1][k] += !j ? wx * one[k] : 0;
@@ -122,13 +124,16 @@ int sim_lobe_by_mirror(struct sim_lobe *lobe, const struct sim_stretch *stretche
             return 0;
         struct sim_facing facing = lobe->start;
         middle = sim_mirror_root(&scene->eye, lobe->a, lobe->b, from, to, 1e-3 * lobe->alpha, &facing, &slope);
+        // The curvature has kinks where the limbus' blend begins, is centred and ends: they must be far off.
+        for (int j = i + 1; j < next; ++j)
+            if (fabs(stretches[j].from - middle) * fabs(slope) < 4 * lobe->alpha) return 0;
         if (!sample(lobe, middle, fabs(slope), &facing, sum, values)) return 0;
     }
     for (int k = 0; k < values; ++k) {
         double bend = fabs(sum[1][k] - sum[0][k]) + fabs(sum[2][k] - sum[0][k]) +
                       fabs(sum[3][k] - sum[1][k] - sum[2][k] + sum[0][k]);
         double whole = sum[3][k] + bend;
-        if (whole > 0 && 6 * bend * bend / whole > scene->quality.tolerance) return 0;
+        if (whole > 0 && 0.15 * bend + 6 * bend * bend / whole > scene->quality.tolerance) return 0;
     }
     for (int k = 0; k < values; ++k) lobe->gaze->out[where[k]] += sum[3][k];
     return 1;

@@ -63,8 +63,12 @@ void sim_profile_init(struct sim_profile *profile, const struct sim_eye *eye) {
         if (cells < 5) cells = 5;
         int room = SIM_PROFILE_RINGS - 1 - profile->n_rings - 6 * (n - 1 - p);
         if (cells > room) cells = room;
-        for (int i = 0; i <= cells; ++i)
-            sim_ring_at(eye, ends[p] + width * i / cells, &profile->rings[profile->n_rings++]);
+        profile->convex[p] = 1;
+        for (int i = 0; i <= cells; ++i) {
+            struct sim_ring *ring = &profile->rings[profile->n_rings++];
+            sim_ring_at(eye, ends[p] + width * i / cells, ring);
+            if (i && ring->n_out * ring[-1].n_up < ring->n_up * ring[-1].n_out) profile->convex[p] = 0;
+        }
     }
     profile->first[n] = profile->n_rings;
 }
@@ -86,42 +90,38 @@ void sim_ring_face(const struct sim_ring *ring, const double a[3], const double 
         double br = b[0] * c + b[1] * s - r, bt = b[1] * c - b[0] * s;
         double ka = 1 / sqrt(ar * ar + at * at + az * az), kb = 1 / sqrt(br * br + bt * bt + bz * bz);
         double lr = ar * ka, lt = at * ka, lz = az * ka, vr = br * kb, vt = bt * kb, vz = bz * kb;
-        double hr = lr + vr, ht = lt + vt, hz = lz + vz;
+        double hr = lr + vr, ht = lt + vt, hz = lz + vz, hn = hr * out + hz * up, hm = hr * up - hz * out;
         // Their derivatives by the azimuth, in the frame that turns along.
         double turn_a = r * ka * lt, turn_b = r * kb * vt;
         double dr = lr * turn_a + lt + vr * turn_b + vt;
         double dt = lt * turn_a - r * ka - lr + vt * turn_b - r * kb - vr;
-        double dz = lz * turn_a + vz * turn_b;
-        double hn = hr * out + hz * up, hm = hr * up - hz * out, size = sqrt(hr * hr + ht * ht + hz * hz);
-        facing->cosine = size / 2;
-        facing->nearest = 1 / fmax(ka, kb);
-        if (hn < 1e-3 * size) {  // behind: as good as infinitely far off
-            facing->c = c;
-            facing->s = s;
-            facing->pace = 1;
+        double dz = lz * turn_a + vz * turn_b, x = 0, pace2 = 0, pace = 0, scale = 1;
+        int behind = hn < 1e-3;
+        if (!behind) {
+            double per = 1 / hn, sm = hm * per, st = ht * per, dn = dr * out + dz * up;
+            double dm = (dr * up - dz * out - sm * dn) * per;
+            dt = (dt - st * dn) * per;
+            pace2 = dm * dm + dt * dt;
+            pace = sqrt(pace2);
+            if (pace2 > 1e-24) x = -(sm * dm + st * dt) / pace2;
+            facing->miss = (st * dm - sm * dt) / (pace + 1e-300);
+        } else {  // as good as infinitely far off
             facing->miss = hm > 0 ? 1e3 : -1e3;
-            return;
         }
-        double dn = dr * out + dz * up, sm = hm / hn, st = ht / hn;
-        double dm = (dr * up - dz * out - sm * dn) / hn;
-        dt = (dt - st * dn) / hn;
-        double pace2 = dm * dm + dt * dt, pace = sqrt(pace2);
-        facing->pace = pace;
-        facing->miss = (st * dm - sm * dt) / (pace + 1e-300);
-        double x = pace2 > 1e-24 ? -(sm * dm + st * dt) / pace2 : 0;
-        if (fabs(x) * (1 + pace) < tolerance || i == 20) {
-            facing->c = c - x * s;
-            facing->s = s + x * c;
-            double n = 1 / sqrt(facing->c * facing->c + facing->s * facing->s);
-            facing->c *= n;
-            facing->s *= n;
-            return;
-        }
+        int settled = behind || fabs(x) * (1 + pace) < tolerance || i == 20;
         if (x > 0.5) x = 0.5;
         if (x < -0.5) x = -0.5;
-        double cx = cos(x), sx = sin(x), turned = c * cx - s * sx;
-        s = s * cx + c * sx;
+        scale = 1 / sqrt(1 + x * x);
+        double turned = (c - x * s) * scale;
+        s = (s + x * c) * scale;
         c = turned;
+        if (!settled) continue;
+        facing->c = c;
+        facing->s = s;
+        facing->pace = behind ? 1 : pace;
+        facing->cosine = sqrt(hr * hr + ht * ht + hz * hz) / 2;
+        facing->nearest = 1 / fmax(ka, kb);
+        return;
     }
 }
 
@@ -201,15 +201,18 @@ int sim_profile_scan(const struct sim_profile *profile, const struct sim_eye *ey
     struct scan scan = {.eye = eye, .a = a, .b = b, .out = out};
     scan.reach = reach / sqrt(1 + reach * reach);
     scan.tolerance = fmin(0.1 * reach, 0.03);
-    struct node nodes[SIM_PROFILE_RINGS];
+    struct node nodes[SIM_PROFILE_RINGS], last;
     struct sim_facing start;
     sim_facing_start(a, b, &start);
     for (int p = 0; p < profile->n_pieces; ++p) {
         int first = profile->first[p], cells = profile->first[p + 1] - first - 1;
-        for (int i = 0; i <= cells; ++i) {
-            nodes[i] = node_at(&scan, &profile->rings[first + i], &start);
-            start = nodes[i].facing;
-        }
+        nodes[0] = p ? last : node_at(&scan, &profile->rings[first], &start);
+        last = node_at(&scan, &profile->rings[first + cells], &nodes[0].facing);
+        if (profile->convex[p] && reach < 0.3 && (nodes[0].miss < -scan.reach || last.miss > scan.reach))
+            continue;
+        for (int i = 1; i < cells; ++i)
+            nodes[i] = node_at(&scan, &profile->rings[first + i], &nodes[i - 1].facing);
+        nodes[cells] = last;
         double width = nodes[1].theta - nodes[0].theta;
         scan.open = 0;
         for (int i = 0; i < cells; ++i) {

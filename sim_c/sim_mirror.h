@@ -26,6 +26,7 @@ struct sim_ring {
 struct sim_profile {
     int n_rings, n_pieces;
     int first[SIM_PROFILE_PIECES + 1];  // ring that starts each piece; a piece has its own ring at both ends
+    int convex[SIM_PROFILE_PIECES];     // along it; the miss only falls there, as h turns against n
     struct sim_ring rings[SIM_PROFILE_RINGS];
 };
 
