@@ -112,7 +112,7 @@ def test_peers_are_compared_at_equal_error(bench):
         "image method": [{"seconds": 1e-2, "rms": 2e-3}, {"seconds": 4e-2, "rms": 1e-3}],
         "Mitsuba 3 llvm_ad_mono": [{"seconds": 0.1, "rms": 2e-3}, {"seconds": 0.4, "rms": 1e-3}],
     }
-    made = bench["bench_peers"].compare(rows, {"mitsuba": "3.9.1"})
+    made = bench["bench_peers"].compare(rows, {"mitsuba": "3.9.1", "sparsegaze": "0.3"})
     by_name = {row["name"]: row for row in made["peers"]}
     assert by_name["Mitsuba 3 llvm_ad_mono"]["version"] == "3.9.1"
     for row in made["peers"]:
@@ -146,12 +146,12 @@ def test_images_tend_to_the_truth_that_they_approach_quadratically(bench):
 
 def test_a_missed_bar_fails_the_run_and_a_missed_aim_does_not(bench, capsys, tmp_path):
     report = {
-        "peers": [dict(name="Mitsuba 3", times_ours=9e3)],
+        "peers": [dict(name="Mitsuba 3 " + kind, times_ours=9e3) for kind in "ab"],
         "agreement": {"total": {"rms": 2e-4}},
         "seconds": 1.0,
     }
     report["bars"] = bench["bench_sim"].bars(report)
-    assert [row["met"] for row in report["bars"]] == [True, False]
+    assert [row["met"] for row in report["bars"]] == [True, True, False, False]
     assert bench["bench_sim"].tell(report, tmp_path) == 0
     report["agreement"]["total"]["rms"] = 2e-3
     report["bars"] = bench["bench_sim"].bars(report)

@@ -191,6 +191,7 @@ def offgrid(headset, quick, say):
         "max": float(np.abs(error).max()),
         "responses_per_second_core": len(many) / seconds,
         "states": n,
+        "pairs": len(pairs),
         "rms_lids_open": rms(error[opened_lids]),
         "max_lids_open": float(np.abs(error[opened_lids]).max()),
         "rms_against_reference": rms(against),
@@ -199,6 +200,14 @@ def offgrid(headset, quick, say):
         "table_seconds": table_seconds,
         "table_mb": size / 1e6,
     }
+
+
+def as_setting(figures, threads):
+    """The tables as a setting among others: {label, seconds, rms} of one pair, by every core; the tables made
+    before.
+    """
+    seconds = 1 / figures["responses_per_second_core"] / figures["pairs"] / threads
+    return {"label": "tables", "seconds": seconds, "rms": figures["rms"]}
 
 
 def cpu_seconds(function):

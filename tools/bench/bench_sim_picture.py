@@ -8,13 +8,15 @@ import numpy as np
 from matplotlib import pyplot
 from matplotlib.ticker import LogLocator, NullFormatter
 
-BLUE, RED, GREY, GREEN, GOLD = "#2f6690", "#c8553d", "#9aa5b1", "#588157", "#d9a441"
-STYLE = {
-    "sparsegaze": (BLUE, "o", "ours: whole maps"),
-    "off the grid": (GREEN, "D", "ours: tables between their nodes"),
-    "image method": (GOLD, "s", "our image method"),
-    "Mitsuba 3 llvm_ad_mono": (RED, "^", "Mitsuba 3, llvm"),
-    "Mitsuba 3 scalar_rgb": ("#7d4e57", "v", "Mitsuba 3, scalar"),
+BLUE, RED, GREY, GREEN, GOLD, PLUM = "#2f6690", "#c8553d", "#9aa5b1", "#588157", "#d9a441", "#7d4e57"
+STYLE = {  # colour, marker, line, words
+    "sparsegaze": (BLUE, "o", "-", "ours: whole maps, the peers' scene"),
+    "sparsegaze, whole scene": (BLUE, "o", ":", "ours: whole maps, the default headset"),
+    "tables": (GREEN, "D", "", "ours: tables between their nodes, made before"),
+    "image method": (GOLD, "s", "-", "our image method, the peers' scene"),
+    "image method, whole scene": (GOLD, "s", ":", "our image method, the default headset"),
+    "Mitsuba 3 llvm_ad_mono": (RED, "^", "", "Mitsuba 3, llvm"),
+    "Mitsuba 3 scalar_rgb": (PLUM, "v", "", "Mitsuba 3, scalar"),
 }
 
 
@@ -50,34 +52,20 @@ def draw(path, report):
 def _curves(axis, report):
     curves = report["curves"]
     for name, rows in curves.items():
-        colour, marker, label = STYLE.get(name, (GREY, ".", name))
-        groups = {}
+        colour, marker, line, words = STYLE.get(name, (GREY, ".", "", name))
+        samplers = {}
         for row in rows:
-            groups.setdefault(row["label"].partition(", ")[2], []).append(row)
-        for group, (sampler, members) in enumerate(sorted(groups.items())):
+            samplers.setdefault(row["label"].partition(", ")[2], []).append(row)
+        for sampler, members in sorted(samplers.items()):
             x, y = np.array(sorted((row["seconds"], row["rms"]) for row in members)).T
-            film = name.startswith("Mitsuba")  # several films at once make no line
-            hollow = "white" if film and group == 0 else colour
-            axis.plot(
-                x,
-                y,
-                marker + ("" if film else "-"),
-                color=colour,
-                ms=8,
-                lw=1.6,
-                mfc=hollow,
-                label=label + (", " + sampler if sampler else ""),
+            inside = "white" if sampler == "independent" or line == ":" else colour
+            label = words + (", " + sampler if sampler else "")
+            axis.plot(x, y, marker + line, color=colour, ms=7, lw=1.6, mfc=inside, label=label)
+        for row in rows if line == "-" else []:
+            place = (row["seconds"], row["rms"])
+            axis.annotate(
+                row["label"], place, textcoords="offset points", xytext=(8, 3), fontsize=8, color=colour
             )
-            if not film:
-                for row in members:
-                    axis.annotate(
-                        row["label"],
-                        (row["seconds"], row["rms"]),
-                        textcoords="offset points",
-                        xytext=(8, 3),
-                        fontsize=8,
-                        color=colour,
-                    )
     axis.axhline(1e-3, color=GREY, ls=":", lw=1)
     axis.axhline(1e-4, color=GREY, ls="--", lw=1)
     axis.text(
@@ -101,14 +89,15 @@ def _curves(axis, report):
         transform=axis.get_yaxis_transform(),
     )
     axis.set(
-        title="Speed against error: one response of the peers' scene",
+        title="Speed against error, one response",
         xscale="log",
         yscale="log",
         xlabel="seconds per response (one sensor, one emitter, one gaze; every core)",
         ylabel="rms error (of the mean response)",
     )
     axis.grid(alpha=0.25)
-    axis.legend(fontsize=8, loc="lower left")
+    axis.legend(fontsize=8, loc="lower right")
+    axis.set_ylim(bottom=min(row["rms"] for rows in curves.values() for row in rows) / 30)
 
 
 def _scenes(axis, report):
@@ -247,7 +236,7 @@ def _bars(axis, report):
     axis.set(title="Bars and aims", xlim=(0, 1))
     rows = report["bars"]
     for i, row in enumerate(rows):
-        y = 1 - (i + 0.7) / (len(rows) + 0.5)
+        y = 1 - (i + 0.7) / (max(len(rows), 24) + 0.5)
         colour = GREEN if row["met"] else (RED if row["kind"] == "bar" else GOLD)
         words = "met" if row["met"] else ("MISSED" if row["kind"] == "bar" else "short of")
         axis.text(0.0, y, row["name"], fontsize=9, transform=axis.transAxes)
