@@ -89,7 +89,7 @@ def test_a_real_scene_gives_every_key(bench):
 
     ends = [port(place, (0, 0, -11), 10.0, 1.5) for place in ((14, -8, -28), (-12, -10, -31))]
     case = Case("one pair", pair(*ends), nominal_person(), ((3.0, -2.0, 3.5, 1.0),))
-    row = bench["bench_errors"].scene_row(case, 1)
+    row = bench["bench_errors"].scene_row(case, bench["bench_errors"].reference_of(case), 1)
     wanted = {"name", "rms_total", "rms_diffuse", "rms_glint", "max_total", "estimate_bounds", "seconds"}
     assert wanted <= set(row)
     assert 0 < row["rms_total"] < 1e-2 and row["seconds"] > 0

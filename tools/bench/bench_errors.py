@@ -11,6 +11,7 @@ import os
 import sys
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -31,16 +32,30 @@ def scenes(count, threads, say):
     """
     from random_scenes import random_scenes
 
+    cases, truths = random_scenes(count), []
+    with ProcessPoolExecutor(threads) as pool:
+        for number, truth in enumerate(pool.map(reference_of, cases)):
+            say("reference %d of %d: %s" % (number + 1, count, cases[number].name))
+            truths.append(truth)
     rows = []
-    for number, case in enumerate(random_scenes(count)):
+    for number, (case, truth) in enumerate(zip(cases, truths)):
         say("scene %d of %d: %s" % (number + 1, count, case.name))
-        rows.append(scene_row(case, threads))
+        rows.append(scene_row(case, truth, threads))
     return rows
 
 
-def scene_row(case, threads=2):
+def reference_of(case):
+    """{value, doubt: {term: [state, pair]}, seconds} of a case by the reference, pairs of two places."""
+    from reference import other_pairs, reference_states
+
+    began = time.process_time()
+    value, doubt, _ = reference_states(case.headset, case.person, case.states, other_pairs(case.headset))
+    return {"value": value, "doubt": doubt, "seconds": time.process_time() - began}
+
+
+def scene_row(case, truth, threads=2):
     """One scene: a map whose axes hold the case's gazes, every term against the reference at those."""
-    from reference import TERMS, other_pairs, reference_states
+    from reference import TERMS, other_pairs
 
     from sparsegaze.mapmake import Making
 
@@ -55,20 +70,17 @@ def scene_row(case, threads=2):
     parts = making.make()
     bound = making.bound(parts)
     seconds = time.perf_counter() - began
-    pairs = other_pairs(case.headset)
-    began = time.perf_counter()
-    truth, doubt, _ = reference_states(case.headset, case.person, case.states, pairs)
-    reference_seconds = time.perf_counter() - began
+    s, e = np.array(other_pairs(case.headset)).T
     at = [(np.searchsorted(elevation, el), np.searchsorted(azimuth, az)) for az, el in states[:, :2]]
-    s, e = np.array(pairs).T
     got = {t: np.array([parts[t][i, s, e, row, col] for i, (row, col) in enumerate(at)]) for t in TERMS}
     bounds = np.array([bound[i, s, e] for i in range(len(states))])
-    made = len(pairs) * len(states) * len(azimuth) * len(elevation)
-    return judge(case.name, got, truth, bounds, sum(doubt.values()), making.mean) | {
+    figures = judge(case.name, got, truth["value"], bounds, sum(truth["doubt"].values()), making.mean)
+    return figures | {
         "seconds": seconds,
-        "responses": made,
+        "responses": len(s) * len(states) * len(azimuth) * len(elevation),
         "estimate_rms": float(np.sqrt(sum(v * v for v in making.rms.values()))),
-        "reference_seconds": reference_seconds,
+        "left_out": list(making.left_out()),
+        "reference_seconds": truth["seconds"],
     }
 
 

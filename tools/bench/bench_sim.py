@@ -50,17 +50,24 @@ def main():
     for name in ("sim.json", "sim.png"):  # those of an earlier run must not pass for this one's
         (options.out / name).unlink(missing_ok=True)
     try:
-        report = run(wanted, options.quick)
+        report = run(wanted, options.quick, lambda report: write(options.out, report))
     except (SparsegazeError, RuntimeError) as error:
         print("bench-sim: %s" % error, file=sys.stderr)
         return 1
-    (options.out / "sim.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     draw(options.out / "sim.png", report)
     return tell(report, options.out)
 
 
-def run(wanted, quick):
-    """The report as a dict: every section's figures, bars, machine."""
+def write(folder, report):
+    """sim.json."""
+    (folder / "sim.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+
+def run(wanted, quick, keep):
+    """The report: a dict of every section's figures, bars, machine.
+
+    keep    called with what there is after each section: an interrupted run leaves what it has measured
+    """
     headset, clock, threads = load_headset(HEADSET), Clock(), len(os.sched_getaffinity(0))
     threads = min(2, threads)
     sections = {
@@ -78,7 +85,6 @@ def run(wanted, quick):
         "machine": machine(),
         "section_seconds": {},
     }
-    # What is timed goes first: the reference leaves a warm machine behind.
     for name in ("speed", "scaling", "peers", "ring", "offgrid", "scenes", "images"):
         if name not in wanted:
             continue
@@ -86,10 +92,11 @@ def run(wanted, quick):
         figures = sections[name](lambda text, name=name: clock.say(name, text))
         report.update(figures if name == "peers" else {name: figures})
         report["section_seconds"][name] = round(time.perf_counter() - began, 1)
-    if "offgrid" in report and "peers" in report:
-        report["curves"]["tables"] = [bench_errors.as_setting(report["offgrid"], threads)]
-    report["seconds"] = round(clock.seconds(), 1)
-    report["bars"] = bars(report)
+        if "offgrid" in report and "peers" in report:
+            report["curves"]["tables"] = [bench_errors.as_setting(report["offgrid"], threads)]
+        report["seconds"] = round(clock.seconds(), 1)
+        report["bars"] = bars(report)
+        keep(plain(report))
     return plain(report)
 
 
