@@ -1,14 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The terms that vary slowly with gaze: sclera over the lids' opening (from margin to margin, in the head
-// frame), iris over rings between pupil edges (in the eye frame, light in and out through the cornea).
+// The terms that vary slowly with gaze, and what they share: windows, and sums over batches of points.
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
-#include "sim_inside.h"
-
-#define PI 3.14159265358979323846
+#include "sim_wide.h"
 
 double sim_window_weight(const struct sim_window *window, const double away[3]) {
     double c = -sim_dot(window->aim, away);
@@ -58,154 +55,174 @@ double sim_surface_transfer(const struct sim_site *site, const double point[3], 
     return lens_cosine(sim_dot(away, normal), site->radius / n + 1e-9) / n2;
 }
 
-static void to_eye(const double axes[9], const double head[3], double eye[3]) {
-    for (int j = 0; j < 3; ++j) eye[j] = axes[j] * head[0] + axes[3 + j] * head[1] + axes[6 + j] * head[2];
+// A port's narrowness where its axis comes nearest to the eye's centre; a site's where it is above the eye.
+static int focus_on(const double at[3], double scale, double reach_mm, double globe, struct sim_focus *focus) {
+    double size = sqrt(sim_dot(at, at)) + 1e-9;
+    if (scale > 3) return 0;
+    focus->alpha = atan2(at[0], -at[2]);
+    focus->beta = asin(at[1] / size);
+    focus->reach = reach_mm / globe + (size < globe ? 0 : 0.2);
+    focus->scale_mm = scale;
+    return 1;
 }
 
-static void to_head(const double axes[9], const double eye[3], double head[3]) {
-    for (int i = 0; i < 3; ++i)
-        head[i] = axes[3 * i] * eye[0] + axes[3 * i + 1] * eye[1] + axes[3 * i + 2] * eye[2];
-}
-
-// How much of a site's lens a point of the sclera sees past the corneal bulge. The bulge is a sphere here.
-static double past_cornea(const struct sim_scene *scene, const double point[3], const double axis[3],
-                          const double away[3], double distance, double lens) {
-    const struct sim_eye *eye = &scene->eye;
-    double centre = eye->apex - eye->radius, c[3];
-    for (int k = 0; k < 3; ++k) c[k] = centre * axis[k] - point[k];
-    double along = sim_dot(c, away);
-    if (along <= 0) return 1;
-    double miss2 = sim_dot(c, c) - along * along, miss = sqrt(miss2 > 0 ? miss2 : 0) - eye->radius;
-    double spread = (lens + 0.3) * along / distance;
-    return sim_step(miss / (2 * spread + 1e-9) + 0.5);
-}
-
-static void add_sclera(const struct sim_scene *scene, const double axes[9], double elevation_deg,
-                       double opening, double *out) {
-    const struct sim_eye *eye = &scene->eye;
-    struct sim_lid lid;
-    sim_lid_pose(&lid, &scene->person, elevation_deg, opening);
-    double axis[3] = {axes[2], axes[5], axes[8]};
-    double albedo = scene->person.albedo_sclera / PI;
-    for (int i = 0; i < scene->gauss_nodes[0]; ++i) {
-        double alpha = lid.half * scene->gauss[0][i], upper, lower;
-        sim_lid_margins(&lid, alpha, &upper, &lower);
-        if (upper <= lower) continue;
-        double sa = sin(alpha), ca = cos(alpha);
-        for (int j = 0; j < scene->gauss_nodes[1]; ++j) {
-            double beta = (upper + lower) / 2 + (upper - lower) / 2 * scene->gauss[1][j];
-            double sb = sin(beta), cb = cos(beta);
-            struct sim_lid_point at = {.radial = {sa * cb, sb, -ca * cb}, .up = {-sa * sb, cb, ca * sb}};
-            double d[3], rho_d;
-            to_eye(axes, at.radial, d);
-            double s = sqrt(d[0] * d[0] + d[1] * d[1]), rho = sim_eye_rho(eye, s, d[2], &rho_d);
-            double white = d[2] > 0 ? sim_eye_whiteness(eye, rho * s) : 1;
-            if (white == 0) continue;
-            // Area vector rho (rho e_r - rho' e_theta) per unit solid angle.
-            double cut = s > 1e-9 ? rho_d * d[2] / s : 0;
-            double n_eye[3] = {rho * d[0] - cut * d[0], rho * d[1] - cut * d[1], rho * d[2] + rho_d * s},
-                   normal[3];
-            double length = sqrt(sim_dot(n_eye, n_eye));
-            to_head(axes, n_eye, normal);
-            double point[3], transfer[2 * SIM_MAX_PORTS], away[2 * SIM_MAX_PORTS][3];
-            for (int k = 0; k < 3; ++k) {
-                normal[k] /= length;
-                point[k] = rho * at.radial[k];
-            }
-            sim_lid_measure(&lid, alpha, beta, rho, &at);
-            int lit = 0;
-            for (int k = 0; k < scene->n_sites; ++k) {
-                double distance, t = sim_surface_transfer(&scene->sites[k], point, normal, away[k], &distance);
-                if (t > 0) t *= sim_lid_open_toward(&lid, &at, away[k]);
-                if (t > 0) t *= past_cornea(scene, point, axis, away[k], distance, scene->sites[k].radius);
-                if (t > 0) t *= sim_face_eye_reach(&scene->face, k, alpha, beta);
-                transfer[k] = t;
-                lit |= t > 0;
-            }
-            if (!lit) continue;
-            double sensor_part[SIM_MAX_PORTS], emitter_part[SIM_MAX_PORTS];
-            sim_ports_at(scene, transfer, away, sensor_part, emitter_part);
-            double weight = lid.half * scene->gauss[0][scene->gauss_nodes[0] + i] * (upper - lower) / 2 *
-                            scene->gauss[1][scene->gauss_nodes[1] + j] * cb * rho * length;
-            sim_add_pairs(scene, weight * albedo * white, sensor_part, emitter_part, out);
-        }
+static void find_foci(const struct sim_scene *scene, struct sim_light *light) {
+    double globe = scene->eye.globe;
+    for (int i = 0; i < scene->n_sensors + scene->n_emitters; ++i) {
+        const struct sim_window *w = i < scene->n_sensors ? &scene->sensors[i] : &scene->emitters[i - scene->n_sensors];
+        const double *from = scene->sites[w->site].position;
+        double nearest = -sim_dot(from, w->aim), miss2 = sim_dot(from, from) - nearest * nearest;
+        double inside = globe * globe - miss2, length = nearest - (inside > 0 ? sqrt(inside) : 0), at[3];
+        if (length < 1) continue;  // looks away
+        for (int k = 0; k < 3; ++k) at[k] = from[k] + length * w->aim[k];
+        double scale = length / sqrt(2 * w->per_tan2);
+        light->n_foci += focus_on(at, scale, 4.5 * scale, globe, &light->foci[light->n_foci]);
     }
-}
-
-// One spot of the iris: light in and out through the cornea, for all lid poses.
-static void add_iris_spot(const struct sim_scene *scene, const double axes[9], const double sites_eye[][3],
-                          const double spot[3], double weight, const struct sim_lid *lids, int n_lids,
-                          double *out) {
-    int pairs = scene->n_sensors * scene->n_emitters;
-    double transfer[2 * SIM_MAX_PORTS], away[2 * SIM_MAX_PORTS][3], alpha[2 * SIM_MAX_PORTS];
-    double beta[2 * SIM_MAX_PORTS], rho[2 * SIM_MAX_PORTS];
-    struct sim_lid_point at[2 * SIM_MAX_PORTS];
     for (int k = 0; k < scene->n_sites; ++k) {
-        double exit[3], head[3], d[3];
-        double t = sim_eye_refract(&scene->eye, sites_eye[k], spot, exit);
-        if (t > 0) t *= 1 - sim_eye_whiteness(&scene->eye, sqrt(exit[0] * exit[0] + exit[1] * exit[1]));
-        transfer[k] = t;
-        if (t <= 0) continue;
-        to_head(axes, exit, head);
-        for (int i = 0; i < 3; ++i) d[i] = scene->sites[k].position[i] - head[i];
-        double n = sqrt(sim_dot(d, d));
-        for (int i = 0; i < 3; ++i) away[k][i] = d[i] / n;
-        rho[k] = sim_lid_locate(head, &at[k], &alpha[k], &beta[k]);
-        transfer[k] *= sim_face_eye_reach(&scene->face, k, alpha[k], beta[k]);
-    }
-    double sensor_all[SIM_MAX_PORTS], emitter_all[SIM_MAX_PORTS];
-    sim_ports_at(scene, transfer, away, sensor_all, emitter_all);
-    for (int l = 0; l < n_lids; ++l) {
-        double open[2 * SIM_MAX_PORTS], sensor_part[SIM_MAX_PORTS], emitter_part[SIM_MAX_PORTS];
-        for (int k = 0; k < scene->n_sites; ++k) {
-            open[k] = 0;
-            if (transfer[k] <= 0) continue;
-            sim_lid_measure(&lids[l], alpha[k], beta[k], rho[k], &at[k]);
-            open[k] = sim_lid_open_toward(&lids[l], &at[k], away[k]);
-        }
-        for (int s = 0; s < scene->n_sensors; ++s)
-            sensor_part[s] = sensor_all[s] * open[scene->sensors[s].site];
-        for (int e = 0; e < scene->n_emitters; ++e)
-            emitter_part[e] = emitter_all[e] * open[scene->emitters[e].site];
-        sim_add_pairs(scene, weight, sensor_part, emitter_part, out + l * pairs);
+        const double *at = scene->sites[k].position;
+        double height = sqrt(sim_dot(at, at)) - globe, below[3];
+        for (int i = 0; i < 3; ++i) below[i] = at[i] * 0.9 * globe / (height + globe);
+        light->n_foci += focus_on(below, height / 2, 2 * height, globe, &light->foci[light->n_foci]);
     }
 }
 
-// Rings between successive pupil edges and from the last to the limbus, summed from outside in: the iris of a
-// small pupil is that of the next larger one plus a ring.
-static int add_iris(const struct sim_scene *scene, const double axes[9], double elevation_deg,
-                    const double *pupil_mm, int n_pupils, const double *lid_opening, int n_lids,
-                    double *out) {
-    const struct sim_eye *eye = &scene->eye;
-    int around = (int)ceil(64 * scene->quality.iris);
-    int block = n_lids * scene->n_sensors * scene->n_emitters;
-    struct sim_lid lids[SIM_MAX_LIDS];
-    double sites_eye[2 * SIM_MAX_PORTS][3], *ring = malloc((size_t)block * sizeof *ring);
-    if (!ring) return -1;
-    for (int l = 0; l < n_lids; ++l) sim_lid_pose(&lids[l], &scene->person, elevation_deg, lid_opening[l]);
-    for (int k = 0; k < scene->n_sites; ++k) to_eye(axes, scene->sites[k].position, sites_eye[k]);
-    double albedo = scene->person.albedo_iris / (PI * eye->index * eye->index);
-    memset(ring, 0, (size_t)block * sizeof *ring);
-    for (int p = n_pupils - 1; p >= 0; --p) {
-        int last = p == n_pupils - 1, n = last ? scene->gauss_nodes[3] : scene->gauss_nodes[2];
-        const double *gauss = scene->gauss[last ? 3 : 2];
-        double from = pupil_mm[p] / 2, to = last ? eye->limbus : pupil_mm[p + 1] / 2;
-        // The edge nodes are meant for the outermost 2 mm or so, where the cornea ends.
-        int panels = (int)ceil((to - from) / 2);
-        double half = (to - from) / (2 * panels);
-        for (int i = 0; i < n * panels; ++i) {
-            double r = from + half * (2 * (i / n) + 1 + gauss[i % n]);
-            double weight = half * gauss[n + i % n] * r * 2 * PI / around * albedo;
-            for (int j = 0; j < around; ++j) {
-                double phi = 2 * PI * (j + 0.5) / around;
-                double spot[3] = {r * cos(phi), r * sin(phi), eye->iris_z};
-                add_iris_spot(scene, axes, (const double (*)[3])sites_eye, spot, weight, lids, n_lids, ring);
-            }
-        }
-        for (int k = 0; k < block; ++k) out[(size_t)p * (size_t)block + (size_t)k] += ring[k];
-    }
-    free(ring);
+static int by_place(const void *a, const void *b) {
+    const struct sim_site *one = *(const struct sim_site *const *)a, *other = *(const struct sim_site *const *)b;
+    for (int k = 0; k < 3; ++k)
+        if (one->position[k] != other->position[k]) return one->position[k] < other->position[k] ? -1 : 1;
+    return (one->radius > other->radius) - (one->radius < other->radius);
+}
+
+int sim_light_open(struct sim_light *light, const struct sim_scene *scene) {
+    size_t sites = (size_t)scene->n_sites * SIM_BATCH;
+    size_t ports = (size_t)(scene->n_sensors + scene->n_emitters), foci = ports + (size_t)scene->n_sites;
+    memset(light, 0, sizeof *light);
+    light->memory = calloc(10 * sites + 2 * ports * SIM_BATCH + 2 * SIM_COLUMNS * (size_t)scene->n_sites,
+                           sizeof(double));
+    light->foci = malloc(foci * sizeof *light->foci);
+    light->order = malloc((size_t)scene->n_sites * sizeof *light->order);
+    if (!light->memory || !light->foci || !light->order) return -1;
+    for (int k = 0; k < scene->n_sites; ++k) light->order[k] = &scene->sites[k];
+    qsort(light->order, (size_t)scene->n_sites, sizeof *light->order, by_place);
+    double **array[] = {&light->transfer, &light->alpha, &light->beta, &light->distance, &light->out,
+                        &light->tangent, &light->open};
+    light->away = light->memory;
+    for (size_t i = 0; i < sizeof array / sizeof *array; ++i) *array[i] = light->memory + (3 + i) * sites;
+    light->part = light->memory + 10 * sites;
+    light->shown = light->part + ports * SIM_BATCH;
+    light->survey = light->shown + ports * SIM_BATCH;
+    find_foci(scene, light);
     return 0;
+}
+
+void sim_light_close(struct sim_light *light) {
+    free(light->memory);
+    free(light->foci);
+    free(light->order);
+}
+
+SIM_WIDE static void weigh_window(const struct sim_window *window, const double *away, const double *transfer,
+                                  int n, double *part) {
+    const double *x = away, *y = away + SIM_BATCH, *z = away + 2 * SIM_BATCH;
+    double ax = -window->aim[0], ay = -window->aim[1], az = -window->aim[2], per_tan2 = window->per_tan2;
+    SIM_EACH(p, n)
+        part[p] = transfer[p] * sim_wide_window(ax * x[p] + ay * y[p] + az * z[p], per_tan2);
+}
+
+static int same_window(const struct sim_window *a, const struct sim_window *b) {
+    return a->site == b->site && a->per_tan2 == b->per_tan2 && !memcmp(a->aim, b->aim, sizeof a->aim);
+}
+
+void sim_light_windows(const struct sim_scene *scene, struct sim_light *light, int n) {
+    for (int i = 0; i < scene->n_sensors + scene->n_emitters; ++i) {
+        int e = i - scene->n_sensors;
+        const struct sim_window *w = e < 0 ? &scene->sensors[i] : &scene->emitters[e];
+        double *part = light->part + i * SIM_BATCH;
+        // One lens that senses and emits: the usual headset.
+        if (e >= 0 && e < scene->n_sensors && same_window(w, &scene->sensors[e]))
+            memcpy(part, light->part + e * SIM_BATCH, SIM_BATCH * sizeof *part);
+        else
+            weigh_window(w, light->away + 3 * SIM_BATCH * w->site, light->transfer + SIM_BATCH * w->site,
+                         sim_whole(n), part);
+    }
+}
+
+SIM_WIDE static void add_rows(const double *sensor, const double *emitters, const double *weight, int n, int m,
+                              double *out) {
+    double here[SIM_BATCH];
+    SIM_EACH(p, n) here[p] = weight[p] * sensor[p];
+    for (int e = 0; e < m; ++e) {
+        const double *there = emitters + e * SIM_BATCH;
+        double sum[SIM_LANES] = {0};
+        for (int p = 0; p < n; p += SIM_LANES)
+            for (int j = 0; j < SIM_LANES; ++j) sum[j] += here[p + j] * there[p + j];
+        out[e] += ((sum[0] + sum[4]) + (sum[2] + sum[6])) + ((sum[1] + sum[5]) + (sum[3] + sum[7]));
+    }
+}
+
+void sim_light_pairs(const struct sim_scene *scene, const double *part, const double *weight, int n,
+                     double *out) {
+    const double *emitters = part + scene->n_sensors * SIM_BATCH;
+    for (int s = 0; s < scene->n_sensors; ++s)
+        add_rows(part + s * SIM_BATCH, emitters, weight, sim_whole(n), scene->n_emitters,
+                 out + s * scene->n_emitters);
+}
+
+void sim_break_add(struct sim_breaks *breaks, double at, double apart) {
+    double from = breaks->at[0], to = breaks->at[breaks->n - 1];
+    if (!(at > from + apart && at < to - apart) || breaks->n == (int)(sizeof breaks->at / sizeof *breaks->at)) return;
+    for (int i = 1; i + 1 < breaks->n; ++i)
+        if (fabs(breaks->at[i] - at) < apart) return;
+    int i = breaks->n++;
+    for (; breaks->at[i - 1] > at; --i) breaks->at[i] = breaks->at[i - 1];
+    breaks->at[i] = at;
+}
+
+void sim_break_changes(struct sim_breaks *breaks, const double *value, const double *lower, const double *upper,
+                       int direction, double from, double step) {
+    for (int p = 0; p + 1 < SIM_SAMPLES; ++p) {
+        if ((value[p] < 0) == (value[p + 1] < 0)) continue;
+        if (direction && direction * (value[p + 1] - value[p]) > 0) continue;
+        if (fmin(lower[p], upper[p]) < 0 && fmin(lower[p + 1], upper[p + 1]) < 0) continue;
+        sim_break_add(breaks, from + step * (p + value[p] / (value[p] - value[p + 1])), 0.04 * step);
+    }
+}
+
+int sim_positive(const double *value, int stride, double half, double *from, double *to) {
+    double step = 2 * half / (SIM_COLUMNS - 1);
+    int i = 0, j = SIM_COLUMNS - 1;
+    while (i < j && value[i * stride] < 0) ++i;
+    while (j > i && value[j * stride] < 0) --j;
+    if (value[i * stride] < 0) return 0;
+    *from = -half + step * i;
+    *to = -half + step * j;
+    if (i > 0) *from -= step * value[i * stride] / (value[i * stride] - value[(i - 1) * stride]);
+    if (j < SIM_COLUMNS - 1) *to += step * value[j * stride] / (value[j * stride] - value[(j + 1) * stride]);
+    return 1;
+}
+
+double sim_crossing(const double *value, int first, int direction) {
+    int i = first;
+    for (int j = 1; j < SIM_SAMPLES && value[i] < 0; ++j, i += direction) {
+        double here = value[i], next = value[i + direction];
+        if (next >= 0) return i - direction * here / (next - here);
+    }
+    return i;
+}
+
+double sim_most_of_both(const double *a, const double *b) {
+    double most = -1e9;
+    for (int p = 0; p < SIM_SAMPLES; ++p) {
+        double least = a[p] < b[p] ? a[p] : b[p];
+        most = least > most ? least : most;
+    }
+    return most;
+}
+
+int sim_nodes_for(double want, int *parts) {
+    *parts = (int)ceil(want / SIM_MAX_RULE);
+    int n = (int)ceil(want / *parts);
+    return n < 2 ? 2 : n;
 }
 
 static int bad_lids(const double *lid_opening, int n_lids) {
@@ -226,14 +243,18 @@ int sim_scene_smooth(const struct sim_scene *scene, double azimuth_deg, double e
     }
     size_t pairs = (size_t)(scene->n_sensors * scene->n_emitters), block = (size_t)n_lids * pairs;
     double axes[9];
+    struct sim_light light;
     sim_eye_orient(&scene->eye, azimuth_deg, elevation_deg, axes);
     memset(out, 0, (size_t)n_pupils * block * sizeof *out);
-    for (int l = 0; l < n_lids; ++l) {
+    int bad = sim_light_open(&light, scene);
+    for (int l = 0; !bad && l < n_lids; ++l) {
         if (terms & SIM_TERM_FACE) sim_add_face(scene, elevation_deg, lid_opening[l], out + (size_t)l * pairs);
         if (terms & SIM_TERM_SCLERA)
-            add_sclera(scene, axes, elevation_deg, lid_opening[l], out + (size_t)l * pairs);
+            sim_add_sclera(scene, &light, axes, elevation_deg, lid_opening[l], out + (size_t)l * pairs);
     }
     for (int p = 1; p < n_pupils; ++p) memcpy(out + (size_t)p * block, out, block * sizeof *out);
-    if (!(terms & SIM_TERM_IRIS)) return 0;
-    return add_iris(scene, axes, elevation_deg, pupil_mm, n_pupils, lid_opening, n_lids, out);
+    if (!bad && (terms & SIM_TERM_IRIS))
+        bad = sim_add_iris(scene, &light, axes, elevation_deg, pupil_mm, n_pupils, lid_opening, n_lids, out);
+    sim_light_close(&light);
+    return bad;
 }

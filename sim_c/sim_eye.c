@@ -13,6 +13,17 @@ static void direction(double azimuth_deg, double elevation_deg, double d[3]) {
     d[2] = -cos(a) * cos(e);
 }
 
+// Cosine of the angle from the axis where the surface is at distance r from the axis.
+static double cosine_at(const struct sim_eye *eye, double r) {
+    double from = 0, to = 90 * RADIANS, derivative;
+    for (int i = 0; i < 60; ++i) {
+        double t = (from + to) / 2;
+        if (sim_eye_rho(eye, sin(t), cos(t), &derivative) * sin(t) < r) from = t;
+        else to = t;
+    }
+    return cos(from);
+}
+
 void sim_eye_init(struct sim_eye *eye, const struct sim_person *person) {
     eye->radius = person->cornea_radius_mm;
     eye->p = 1 + person->cornea_asphericity;
@@ -25,6 +36,15 @@ void sim_eye_init(struct sim_eye *eye, const struct sim_person *person) {
     double sag = r2 / (eye->radius + sqrt(eye->radius * eye->radius - eye->p * r2));
     eye->apex = sqrt(eye->globe * eye->globe - r2) + sag;
     eye->iris_z = eye->apex - person->iris_depth_mm;
+    eye->cos_clear = cosine_at(eye, eye->limbus - eye->haze / 2);
+    eye->cos_white = cosine_at(eye, eye->limbus + eye->haze / 2);
+    double from = acos(cosine_at(eye, eye->limbus)), to = 90 * RADIANS, derivative;
+    for (int i = 0; i < 60; ++i) {
+        double t = (from + to) / 2;
+        if (sim_eye_rho(eye, sin(t), cos(t), &derivative) > eye->globe) from = t;
+        else to = t;
+    }
+    eye->cos_blend = cos(from);
     double z[3];
     direction(person->kappa_azimuth_deg, person->kappa_elevation_deg, z);
     // x = up cross z, y = z cross x: any roll will do, the eye is round.

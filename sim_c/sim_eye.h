@@ -40,6 +40,8 @@ struct sim_eye {
     double radius, p, apex, globe, blend;  // conic r^2 = 2 radius s - p s^2 at depth s behind the apex
     double limbus, haze, iris_z, index;
     double rest[9];  // columns: the eye's axes at rest, in the head frame
+    double cos_clear, cos_white, cos_blend;  // of theta: last of the clear cornea, first of the white sclera,
+                                             // first of the bare globe
 };
 
 void sim_eye_init(struct sim_eye *eye, const struct sim_person *person);

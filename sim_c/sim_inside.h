@@ -61,9 +61,7 @@ struct sim_scene {
     int n_sites, n_sensors, n_emitters;
     struct sim_site sites[2 * SIM_MAX_PORTS];
     struct sim_window sensors[SIM_MAX_PORTS], emitters[SIM_MAX_PORTS];
-    double *nodes;  // Gauss-Legendre abscissas on -1..1 and weights: alpha, beta, iris ring, iris edge
-    const double *gauss[4];
-    int gauss_nodes[4];
+    double *nodes;  // memory of the rules
     const double *rule[SIM_MAX_RULE + 1];  // rule[n]: Gauss-Legendre's n abscissas on -1..1, n weights
     struct sim_profile profile;            // of the eye, for the glint
     _Atomic long long glint_counts[3];     // see sim_scene_glint_counts()

@@ -153,24 +153,13 @@ static int prepare(struct sim_scene *scene, char *error, size_t bytes) {
         if (!(fineness[i] >= 0.1 && fineness[i] <= 16))
             return refuse(error, bytes, "quality out of range 0.1..16");
     if (!(q->tolerance >= 0 && q->tolerance < 1)) return refuse(error, bytes, "tolerance out of range");
-    const int counts[4] = {96, 56, 3, 18};  // alpha, beta, iris ring, iris edge
     int total = SIM_MAX_RULE * (SIM_MAX_RULE + 1);
-    for (int i = 0; i < 4; ++i) {
-        int n = (int)ceil(counts[i] * (i < 2 ? q->sclera : q->iris));
-        scene->gauss_nodes[i] = n < 2 ? 2 : n;
-        total += 2 * scene->gauss_nodes[i];
-    }
     if (!(scene->nodes = malloc((size_t)total * sizeof(double))))
         return refuse(error, bytes, "out of memory");
     double *at = scene->nodes;
     for (int n = 1; n <= SIM_MAX_RULE; at += 2 * n++) {
         gauss_legendre(n, at);
         scene->rule[n] = at;
-    }
-    for (int i = 0; i < 4; ++i) {
-        gauss_legendre(scene->gauss_nodes[i], at);
-        scene->gauss[i] = at;
-        at += 2 * scene->gauss_nodes[i];
     }
     sim_profile_init(&scene->profile, &scene->eye);
     double sites[2 * SIM_MAX_PORTS][3], radius[2 * SIM_MAX_PORTS];

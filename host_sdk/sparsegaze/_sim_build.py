@@ -25,6 +25,8 @@ SOURCES = (
     "sim_opening.c",
     "sim_diffuse.c",
     "sim_mirror.c",
+    "sim_sclera.c",
+    "sim_iris.c",
     "sim_glint.c",
     "sim_glint_mirror.c",
     "sim_scene.c",
@@ -75,7 +77,7 @@ def builder():
         sources=[os.path.join(SIM_C, name) for name in SOURCES],
         include_dirs=[SIM_C],
         libraries=["embree3", "dl", "m"],
-        extra_compile_args=["-std=c11", "-O3", "-fno-math-errno", "-Wall", "-Wextra"],
+        extra_compile_args=["-std=c11", "-O3", "-fno-math-errno", "-fno-trapping-math", "-Wall", "-Wextra"],
     )
     return ffi
 

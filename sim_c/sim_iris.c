@@ -1,0 +1,431 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The iris, over rings in the eye's frame: light in and out through the cornea, by Fermat's paths found for a
+// batch of spots at once.
+#include <stdlib.h>
+
+#include "sim_wide.h"
+
+#define PI 3.14159265358979323846
+// At fineness 1: nodes of a piece of a row, mm between them; where the veil or a lid's edge is in mm per haze and
+// softness; nodes of a piece across the rows, mm between rows.
+static const double NODES_ROW = 3, STEP_ROW = 1.0, STEP_VEIL = 0.4, STEP_EDGE = 0.3, NODES_ACROSS = 3, STEP_ACROSS = 0.9;
+static const double STEP_FOCUS = 0.8;  // between points, in standard deviations of the narrowest window
+static const double SETTLED_MM = 1e-6;
+enum { NEWTON_STEPS = 6, PROBE_STEPS = 3 };
+
+struct spots {
+    int n;
+    double x[SIM_BATCH], y[SIM_BATCH], weight[SIM_BATCH];
+    double exit[3][SIM_BATCH], least[SIM_BATCH], step[SIM_BATCH];
+};
+
+struct iris {
+    const struct sim_scene *scene;
+    struct sim_light *light;
+    const double *axes, (*sites)[3];  // sites: eye frame
+    const struct sim_lid *lids;
+    int n_lids;
+    double *ring, across[2], up[2];
+    struct spots at, probe;
+};
+
+// Fermat's length site - (x, y) on the cornea - spot: slopes and second derivatives, lengths of both legs.
+struct path {
+    double gx, gy, hxx, hyy, hxy, per1, per2, ux, uy, uz, vx, vy, vz, zx, zy, z;
+};
+
+SIM_INLINE struct path measure(const struct sim_eye *eye, const double site[3], double sx, double sy, double x,
+                               double y) {
+    struct path t;
+    double n = eye->index, r2 = x * x + y * y, root = sqrt(eye->radius * eye->radius - eye->p * r2);
+    double per_root = 1 / root, cube = eye->p * per_root * per_root * per_root;
+    t.z = eye->apex - r2 / (eye->radius + root);
+    t.zx = -x * per_root;
+    t.zy = -y * per_root;
+    double ux = x - site[0], uy = y - site[1], uz = t.z - site[2];
+    double vx = x - sx, vy = y - sy, vz = t.z - eye->iris_z;
+    t.per1 = 1 / sqrt(ux * ux + uy * uy + uz * uz);
+    t.per2 = 1 / sqrt(vx * vx + vy * vy + vz * vz);
+    t.ux = ux * t.per1;
+    t.uy = uy * t.per1;
+    t.uz = uz * t.per1;
+    t.vx = vx * t.per2;
+    t.vy = vy * t.per2;
+    t.vz = vz * t.per2;
+    double k1 = t.per1, k2 = n * t.per2, bend = t.uz + n * t.vz;
+    double ax = t.ux + t.uz * t.zx, ay = t.uy + t.uz * t.zy, bx = t.vx + t.vz * t.zx, by = t.vy + t.vz * t.zy;
+    t.gx = ax + n * bx;
+    t.gy = ay + n * by;
+    t.hxx = (1 + t.zx * t.zx) * (k1 + k2) - ax * ax * k1 - bx * bx * k2 - bend * (per_root + x * x * cube);
+    t.hyy = (1 + t.zy * t.zy) * (k1 + k2) - ay * ay * k1 - by * by * k2 - bend * (per_root + y * y * cube);
+    t.hxy = t.zx * t.zy * (k1 + k2) - ax * ay * k1 - bx * by * k2 - bend * x * y * cube;
+    return t;
+}
+
+// As sim_eye_refract(), a fixed number of Newton's steps from its first guess. `step` and `least` say how well
+// each has settled: what the next step would be (mm), and the Hessian's lower eigenvalue.
+SIM_WIDE static void refract(const struct sim_eye *eye, const double site[3], int steps, struct spots *s,
+                             double *transfer) {
+    int n = sim_whole(s->n);
+    double index = eye->index, per_index = 1 / index, depth = eye->apex - eye->iris_z, conic = eye->p;
+    double apex_radius = eye->radius, r_apex2 = apex_radius * apex_radius, dz = site[2] - eye->iris_z;
+    double far2 = 0.9 * eye->radius * eye->radius / (eye->p > 0.1 ? eye->p : 0.1);
+    double *x = s->exit[0], *y = s->exit[1], *z = s->exit[2];
+    SIM_EACH(p, n) {  // bend the straight way as the cornea above the spot would
+        double sx = s->x[p], sy = s->y[p], dx = site[0] - sx, dy = site[1] - sy, r2 = sx * sx + sy * sy;
+        double root = sqrt(r_apex2 - conic * r2), height = sim_wide_max(depth - r2 / (apex_radius + root), 0.1);
+        double per = 1 / sqrt(dx * dx + dy * dy + dz * dz), per_normal = 1 / sqrt(r2 + root * root);
+        double nx = sx * per_normal, ny = sy * per_normal, nz = root * per_normal;
+        double cosine = sim_wide_max((dx * nx + dy * ny + dz * nz) * per, 0.0);
+        double bend = sqrt(1 - (1 - cosine * cosine) * per_index * per_index) - cosine * per_index;
+        double along = per * per_index, rise = height / sim_wide_max(along * dz + bend * nz, 0.3);
+        x[p] = sx + (along * dx + bend * nx) * rise;
+        y[p] = sy + (along * dy + bend * ny) * rise;
+    }
+    for (int i = 0; i < steps; ++i)
+        SIM_EACH(p, n) {
+            struct path t = measure(eye, site, s->x[p], s->y[p], x[p], y[p]);
+            double per_det = 1 / (t.hxx * t.hyy - t.hxy * t.hxy);
+            double dx = (t.hxy * t.gy - t.hyy * t.gx) * per_det, dy = (t.hxy * t.gx - t.hxx * t.gy) * per_det;
+            double scale = 1 / sim_wide_max(1.0, fabs(dx) + fabs(dy));
+            double qx = x[p] + scale * dx, qy = y[p] + scale * dy;
+            double back = sqrt(far2 / sim_wide_max(far2, qx * qx + qy * qy));
+            x[p] = back * qx;
+            y[p] = back * qy;
+        }
+    SIM_EACH(p, n) {
+        struct path t = measure(eye, site, s->x[p], s->y[p], x[p], y[p]);
+        double det = t.hxx * t.hyy - t.hxy * t.hxy, middle = (t.hxx + t.hyy) / 2, half = (t.hxx - t.hyy) / 2;
+        double dx = t.hxy * t.gy - t.hyy * t.gx, dy = t.hxy * t.gx - t.hxx * t.gy;
+        s->least[p] = middle - sqrt(half * half + t.hxy * t.hxy);
+        s->step[p] = sqrt(dx * dx + dy * dy) / fabs(det);
+        z[p] = t.z;
+        double metric = 1 + t.zx * t.zx + t.zy * t.zy, per_size = 1 / sqrt(metric);
+        double cos_out = (t.zx * t.ux + t.zy * t.uy - t.uz) * per_size;
+        double cos_in = (t.vz - t.zx * t.vx - t.zy * t.vy) * per_size;
+        double c = sim_wide_max(cos_out, 0.0), inside = sqrt(1 - (1 - c * c) / (index * index));
+        double across = (c - index * inside) / (c + index * inside), along = (inside - index * c) / (inside + index * c);
+        double through = 1 - (across * across + along * along) / 2;
+        double r = sqrt(x[p] * x[p] + y[p] * y[p]);
+        double veil = 1 - sim_wide_step((r - eye->limbus) / eye->haze + 0.5);
+        double spread = index * index * c * cos_in * t.per1 * t.per1 * t.per2 * t.per2 * metric / det;
+        double light = t.vz * through * spread * veil;
+        transfer[p] = (cos_in <= 0) | (t.vz <= 0) ? 0.0 : light;
+    }
+}
+
+// The paths that did not settle, one by one.
+static void mend(const struct sim_eye *eye, const double site[3], struct spots *s, double *transfer) {
+    for (int p = 0; p < s->n; ++p) {
+        if (s->least[p] >= 0.01 && s->step[p] < SETTLED_MM) continue;
+        double spot[3] = {s->x[p], s->y[p], eye->iris_z}, exit[3];
+        double t = sim_eye_refract(eye, site, spot, exit);
+        for (int k = 0; k < 3; ++k) s->exit[k][p] = exit[k];
+        transfer[p] = t > 0 ? t * (1 - sim_eye_whiteness(eye, sqrt(exit[0] * exit[0] + exit[1] * exit[1]))) : 0;
+    }
+    for (int p = s->n; p < sim_whole(s->n); ++p) transfer[p] = 0;
+}
+
+// Where the paths cross the cornea, as the lids see it.
+SIM_WIDE static void locate(const double axes[9], const double place[3], const struct spots *s, int k,
+                            struct sim_light *light) {
+    int n = sim_whole(s->n);
+    double *away = light->away + 3 * k * SIM_BATCH, *alpha = light->alpha + k * SIM_BATCH;
+    double *beta = light->beta + k * SIM_BATCH, *distance = light->distance + k * SIM_BATCH;
+    double *out = light->out + k * SIM_BATCH, *tangent = light->tangent + k * SIM_BATCH;
+    const double *from_x = s->exit[0], *from_y = s->exit[1], *from_z = s->exit[2];
+    SIM_EACH(p, n) {
+        double ex = from_x[p], ey = from_y[p], ez = from_z[p];
+        double x = axes[0] * ex + axes[1] * ey + axes[2] * ez, y = axes[3] * ex + axes[4] * ey + axes[5] * ez;
+        double z = axes[6] * ex + axes[7] * ey + axes[8] * ez;
+        double flat2 = x * x + z * z, flat = sqrt(flat2), rho = sqrt(flat2 + y * y), per_rho = 1 / rho;
+        double dx = place[0] - x, dy = place[1] - y, dz = place[2] - z;
+        double per = 1 / sqrt(dx * dx + dy * dy + dz * dz);
+        dx *= per;
+        dy *= per;
+        dz *= per;
+        // Radial (x, y, z) / rho; up (-sin a sin b, cos b, cos a sin b).
+        double level = (dx * x + dz * z) / flat, rise = dy;
+        double sin_b = y * per_rho, cos_b = flat * per_rho;
+        out[p] = level * cos_b + rise * sin_b;
+        tangent[p] = rise * cos_b - level * sin_b;
+        alpha[p] = sim_wide_angle(x, -z, flat);
+        beta[p] = sim_wide_angle(y, flat, rho);
+        distance[p] = rho;
+        away[p] = dx;
+        away[SIM_BATCH + p] = dy;
+        away[2 * SIM_BATCH + p] = dz;
+    }
+}
+
+// cos b of |b| < 1.5, to 1e-10.
+SIM_INLINE double wide_cosine(double b) {
+    double q = b * b, c = 1 - q / 240;
+    c = 1 - q / 182 * c;
+    c = 1 - q / 132 * c;
+    c = 1 - q / 90 * c;
+    c = 1 - q / 56 * c;
+    c = 1 - q / 30 * c;
+    c = 1 - q / 12 * c;
+    return 1 - q / 2 * c;
+}
+
+// How open one lid pose is toward one site.
+SIM_WIDE static void open_toward(const struct sim_lid *lid, const struct sim_light *light, int k, int n,
+                                 double *open) {
+    const double *alpha = light->alpha + k * SIM_BATCH, *beta = light->beta + k * SIM_BATCH;
+    const double *rho = light->distance + k * SIM_BATCH;
+    const double *out = light->out + k * SIM_BATCH, *tangent = light->tangent + k * SIM_BATCH;
+    double per_half2 = 1 / (lid->half * lid->half), thickness = lid->thickness, per_softness = 1 / lid->softness;
+    double tilt = lid->tilt, upper = lid->upper, lower = lid->lower;
+    SIM_EACH(p, n) {
+        double slope = -2 * alpha[p] * per_half2, arch = 1 - alpha[p] * alpha[p] * per_half2;
+        double line = tilt * alpha[p], b = beta[p];
+        double per_cos = 1 / wide_cosine(b), su = (tilt + upper * slope) * per_cos, sl = (tilt + lower * slope) * per_cos;
+        double above = rho[p] * (line + upper * arch - b) / sqrt(1 + su * su);
+        double below = rho[p] * (b - line - lower * arch) / sqrt(1 + sl * sl);
+        open[p] = sim_wide_open(thickness, per_softness, above, below, out[p], tangent[p]);
+    }
+}
+
+// The same through the lashes.
+SIM_WIDE static void dim(const struct sim_lid *lid, const struct sim_light *light, int k, int n, double *open) {
+    const double *alpha = light->alpha + k * SIM_BATCH, *beta = light->beta + k * SIM_BATCH;
+    const double *rho = light->distance + k * SIM_BATCH;
+    const double *out = light->out + k * SIM_BATCH, *tangent = light->tangent + k * SIM_BATCH;
+    SIM_EACH(p, n) {
+        double a = alpha[p] / lid->half, slope = lid->tilt - 2 * lid->upper * a / lid->half;
+        double su = slope / wide_cosine(beta[p]), upper = lid->tilt * alpha[p] + lid->upper * (1 - a * a);
+        double above = rho[p] * (upper - beta[p]) / sqrt(1 + su * su);
+        open[p] *= sim_wide_lashes(lid, above, out[p], tangent[p]);
+    }
+}
+
+SIM_WIDE static void shade(const double *part, const double *open, int n, double *shown) {
+    SIM_EACH(p, n) shown[p] = part[p] * open[p];
+}
+
+static void flush(struct iris *iris) {
+    const struct sim_scene *scene = iris->scene;
+    struct sim_light *light = iris->light;
+    struct spots *s = &iris->at;
+    if (!s->n) return;
+    int whole = sim_whole(s->n), ports = scene->n_sensors + scene->n_emitters;
+    for (int p = s->n; p < whole; ++p) {
+        s->x[p] = s->x[0];
+        s->y[p] = s->y[0];
+        s->weight[p] = 0;
+    }
+    for (int k = 0; k < scene->n_sites; ++k) {
+        double *transfer = light->transfer + k * SIM_BATCH;
+        refract(&scene->eye, iris->sites[k], NEWTON_STEPS, s, transfer);
+        mend(&scene->eye, iris->sites[k], s, transfer);
+        locate(iris->axes, scene->sites[k].position, s, k, light);
+        if (scene->face.eye_clear[k]) continue;
+        const double *alpha = light->alpha + k * SIM_BATCH, *beta = light->beta + k * SIM_BATCH;
+        for (int p = 0; p < s->n; ++p)
+            if (transfer[p] > 0) transfer[p] *= sim_face_eye_reach(&scene->face, k, alpha[p], beta[p]);
+    }
+    sim_light_windows(scene, light, s->n);
+    for (int l = 0; l < iris->n_lids; ++l) {
+        double *open = light->open;
+        for (int k = 0; k < scene->n_sites; ++k) {
+            open_toward(&iris->lids[l], light, k, whole, open + k * SIM_BATCH);
+            if (iris->lids[l].lash_opacity > 0) dim(&iris->lids[l], light, k, whole, open + k * SIM_BATCH);
+        }
+        for (int i = 0; i < ports; ++i) {
+            int e = i - scene->n_sensors, site = e < 0 ? scene->sensors[i].site : scene->emitters[e].site;
+            shade(light->part + i * SIM_BATCH, open + site * SIM_BATCH, whole, light->shown + i * SIM_BATCH);
+        }
+        sim_light_pairs(scene, light->shown, s->weight, s->n, iris->ring + l * scene->n_sensors * scene->n_emitters);
+    }
+    s->n = 0;
+}
+
+// How far a row's samples lie inside what either margin hides from site k, as in the sclera's rows.
+SIM_WIDE static void look(const struct sim_lid *lid, const struct sim_light *light, int k, double *lower,
+                          double *upper, double *full_lower, double *full_upper) {
+    const double *alpha = light->alpha + k * SIM_BATCH, *beta = light->beta + k * SIM_BATCH;
+    const double *rho = light->distance + k * SIM_BATCH;
+    const double *out = light->out + k * SIM_BATCH, *tangent = light->tangent + k * SIM_BATCH;
+    double per_half2 = 1 / (lid->half * lid->half), half = lid->thickness / 2, soft = lid->softness;
+    double tilt = lid->tilt, upper_at = lid->upper, lower_at = lid->lower;
+    SIM_EACH(p, SIM_SAMPLES) {
+        double arch = 1 - alpha[p] * alpha[p] * per_half2, line = tilt * alpha[p], o = out[p], t = tangent[p];
+        double size = sqrt(t * t + 0.01 * o * o);
+        upper[p] = o * rho[p] * (line + upper_at * arch - beta[p]) - half * (size + t);
+        lower[p] = o * rho[p] * (beta[p] - line - lower_at * arch) - half * (size - t);
+        full_upper[p] = upper[p] - o * soft;
+        full_lower[p] = lower[p] - o * soft;
+    }
+}
+
+// Spots along a row, from end to end.
+static void probe_row(struct iris *iris, double chord, double u) {
+    for (int p = 0; p < SIM_SAMPLES; ++p) {
+        double v = chord * (2.0 * p / (SIM_SAMPLES - 1) - 1);
+        iris->probe.x[p] = u * iris->across[0] + v * iris->up[0];
+        iris->probe.y[p] = u * iris->across[1] + v * iris->up[1];
+    }
+    iris->probe.n = SIM_SAMPLES;
+}
+
+// One row of the disc about the axis: u across, v upward, both in the iris' plane.
+static void add_row(struct iris *iris, double radius, double u, double weight, double step_mm) {
+    const struct sim_scene *scene = iris->scene;
+    const struct sim_eye *eye = &scene->eye;
+    struct sim_light *light = iris->light;
+    struct spots *probe = &iris->probe;
+    double chord = sqrt(radius * radius - u * u), step = 2 * chord / (SIM_SAMPLES - 1);
+    probe_row(iris, chord, u);
+    double from = chord, to = -chord, edge_from = -chord, edge_to = chord;
+    double lower[SIM_SAMPLES], upper[SIM_SAMPLES], full_lower[SIM_SAMPLES], full_upper[SIM_SAMPLES];
+    struct sim_breaks breaks = {2, {-chord, chord}};
+    for (int i = 0; i < scene->n_sites; ++i) {
+        int k = (int)(light->order[i] - scene->sites);
+        refract(eye, iris->sites[k], PROBE_STEPS, probe, light->transfer);
+        locate(iris->axes, scene->sites[k].position, probe, k, light);
+        for (int l = 0; l < iris->n_lids; ++l) {
+            look(&iris->lids[l], light, k, lower, upper, full_lower, full_upper);
+            if (sim_most_of_both(lower, upper) < -0.1 * iris->lids[l].softness) continue;
+            from = fmin(from, -chord + step * sim_crossing(lower, 0, 1));
+            to = fmax(to, -chord + step * sim_crossing(upper, SIM_SAMPLES - 1, -1));
+            edge_from = fmax(edge_from, -chord + step * sim_crossing(full_lower, 0, 1));
+            edge_to = fmin(edge_to, -chord + step * sim_crossing(full_upper, SIM_SAMPLES - 1, -1));
+            if (iris->n_lids > 2) continue;
+            // A site that sets goes behind the far margin once more.
+            sim_break_changes(&breaks, lower, lower, upper, 1, -chord, step);
+            sim_break_changes(&breaks, full_lower, lower, upper, 1, -chord, step);
+            sim_break_changes(&breaks, upper, lower, upper, -1, -chord, step);
+            sim_break_changes(&breaks, full_upper, lower, upper, -1, -chord, step);
+        }
+    }
+    from -= 0.15;  // a little more, for what lies between the samples
+    to += 0.15;
+    if (from >= to) return;
+    double veiled = eye->limbus - eye->haze, clear2 = veiled * veiled - u * u;
+    double clear = clear2 > 0 ? sqrt(clear2) : 0;
+    sim_break_add(&breaks, from, 0.01);
+    sim_break_add(&breaks, to, 0.01);
+    sim_break_add(&breaks, edge_from, 0.1);
+    sim_break_add(&breaks, edge_to, 0.1);
+    if (clear > 0) {
+        sim_break_add(&breaks, -clear, 0.1);
+        sim_break_add(&breaks, clear, 0.1);
+    }
+    for (int i = 0; i + 1 < breaks.n; ++i) {
+        double at = (breaks.at[i] + breaks.at[i + 1]) / 2, length = breaks.at[i + 1] - breaks.at[i], h = fmin(step_mm, STEP_ROW);
+        if (at < from || at > to) continue;
+        if (fabs(at) > clear) h = fmin(h, STEP_VEIL * eye->haze);
+        if (at < edge_from || at > edge_to) h = fmin(h, STEP_EDGE * iris->lids[0].softness);
+        int parts, n = sim_nodes_for(scene->quality.iris * (NODES_ROW + length / h), &parts);
+        const double *rule = scene->rule[n];
+        double half = length / (2 * parts);
+        for (int j = 0; j < n * parts; ++j) {
+            double v = breaks.at[i] + half * (2 * (j / n) + 1 + rule[j % n]);
+            int p = iris->at.n++;
+            iris->at.x[p] = u * iris->across[0] + v * iris->up[0];
+            iris->at.y[p] = u * iris->across[1] + v * iris->up[1];
+            iris->at.weight[p] = weight * half * rule[n + j % n];
+            if (iris->at.n == SIM_BATCH) flush(iris);
+        }
+    }
+}
+
+// Where rows begin and cease to see each site past the first pose of the lids, as t of add_disc().
+static void survey(struct iris *iris, double radius, struct sim_breaks *breaks) {
+    const struct sim_scene *scene = iris->scene;
+    struct sim_light *light = iris->light;
+    int sites = scene->n_sites;
+    if (sites > 8 || iris->n_lids > 2) return;
+    double value[4][SIM_SAMPLES], *open = light->survey, *full = open + SIM_COLUMNS * sites, a, b;
+    for (int l = 0; l < iris->n_lids; ++l) {
+        for (int i = 0; i < SIM_COLUMNS; ++i) {
+            double t = PI / 2 * (2.0 * i / (SIM_COLUMNS - 1) - 1);
+            probe_row(iris, radius * cos(t), radius * sin(t));
+            for (int j = 0; j < sites; ++j) {
+                int k = (int)(light->order[j] - scene->sites);
+                refract(&scene->eye, iris->sites[k], PROBE_STEPS, &iris->probe, light->transfer);
+                locate(iris->axes, scene->sites[k].position, &iris->probe, k, light);
+                look(&iris->lids[l], light, k, value[0], value[1], value[2], value[3]);
+                open[i * sites + j] = sim_most_of_both(value[0], value[1]);
+                full[i * sites + j] = sim_most_of_both(value[2], value[3]);
+            }
+        }
+        for (int k = 0; k < 2 * sites; ++k)
+            if (sim_positive(k < sites ? open + k : full + k - sites, sites, PI / 2, &a, &b)) {
+                sim_break_add(breaks, a, 0.05);
+                sim_break_add(breaks, b, 0.05);
+            }
+    }
+}
+
+// The disc within a radius, times a factor. Rows at radius * sin(t) are smooth in t up to their ends.
+static void add_disc(struct iris *iris, double radius, double factor, double step_mm) {
+    struct sim_breaks breaks = {2, {-PI / 2, PI / 2}};
+    survey(iris, radius, &breaks);
+    for (int piece = 0; piece + 1 < breaks.n; ++piece) {
+        int parts;
+        double from = breaks.at[piece], length = breaks.at[piece + 1] - from;
+        double want = NODES_ACROSS + radius * length / fmin(step_mm, STEP_ACROSS);
+        int n = sim_nodes_for(iris->scene->quality.iris * want, &parts);
+        const double *rule = iris->scene->rule[n];
+        double half = length / (2 * parts);
+        for (int i = 0; i < n * parts; ++i) {
+            double t = from + half * (2 * (i / n) + 1 + rule[i % n]);
+            add_row(iris, radius, radius * sin(t), factor * radius * cos(t) * half * rule[n + i % n], step_mm);
+        }
+    }
+    flush(iris);
+}
+
+// The iris of a pupil is the disc within the limbus less that within the pupil: nothing but the domain depends
+// on the pupil.
+int sim_add_iris(const struct sim_scene *scene, struct sim_light *light, const double axes[9],
+                 double elevation_deg, const double *pupil_mm, int n_pupils, const double *lid_opening,
+                 int n_lids, double *out) {
+    const struct sim_eye *eye = &scene->eye;
+    size_t block = (size_t)(n_lids * scene->n_sensors * scene->n_emitters);
+    struct sim_lid lids[SIM_MAX_LIDS];
+    double(*sites)[3] = malloc((size_t)scene->n_sites * sizeof *sites), *disc = calloc(block, sizeof *disc);
+    struct iris *iris = malloc(sizeof *iris);
+    if (!disc || !sites || !iris) {
+        free(disc);
+        free(sites);
+        free(iris);
+        return -1;
+    }
+    for (int l = 0; l < n_lids; ++l) sim_lid_pose(&lids[l], &scene->person, elevation_deg, lid_opening[l]);
+    for (int k = 0; k < scene->n_sites; ++k)
+        for (int j = 0; j < 3; ++j) {
+            const double *p = scene->sites[k].position;
+            sites[k][j] = axes[j] * p[0] + axes[3 + j] * p[1] + axes[6 + j] * p[2];
+        }
+    double step = 1e9, up = sqrt(axes[3] * axes[3] + axes[4] * axes[4]);
+    for (int i = 0; i < light->n_foci; ++i) step = fmin(step, STEP_FOCUS * light->foci[i].scale_mm);
+    iris->scene = scene;
+    iris->light = light;
+    iris->axes = axes;
+    iris->sites = (const double(*)[3])sites;
+    iris->lids = lids;
+    iris->n_lids = n_lids;
+    iris->ring = disc;
+    iris->at.n = 0;
+    iris->up[0] = axes[3] / up;  // the head's up, seen along the axis
+    iris->up[1] = axes[4] / up;
+    iris->across[0] = iris->up[1];
+    iris->across[1] = -iris->up[0];
+    double albedo = scene->person.albedo_iris / (PI * eye->index * eye->index);
+    add_disc(iris, eye->limbus, albedo, step);
+    for (int p = 0; p < n_pupils; ++p)
+        for (size_t i = 0; i < block; ++i) out[(size_t)p * block + i] += disc[i];
+    for (int p = 0; p < n_pupils; ++p) {
+        iris->ring = out + (size_t)p * block;
+        add_disc(iris, pupil_mm[p] / 2, -albedo, step);
+    }
+    free(disc);
+    free(sites);
+    free(iris);
+    return 0;
+}
