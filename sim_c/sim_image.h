@@ -5,13 +5,14 @@
 //
 // Camera    a pinhole at the sensor's place. Square pixels in the tangent of the angle off the sensor's axis,
 //           as many as `pixels` over +-half_width_sigmas of its window on both sides; the value of a pixel is
-//           that at its centre. Row 0 is on top; up is the head's +y. Seen from in front of a face, so a right
+//           that at its centre. Row 0 is on top; up is the head's +y. Seen from in front of a face: a right
 //           eye's temple (+x) is on the left.
-// Radiance  of every pixel for one emitter alone, per unit of its axial intensity, 1/mm^2. The sum over pixels
-//           of radiance * window * solid angle is the response of sim_scene.h, but for: pixels (edges and
-//           narrow glints alias), the window beyond the image's border, and the sensor's lens, which a
+// Radiance  of every pixel for one emitter alone, per unit of its axial intensity, 1/mm^2. The sum over
+//           pixels of radiance * window * solid angle is the response of sim_scene.h, but for: pixels (edges
+//           and narrow glints alias), the window beyond the image's border, and the sensor's lens, which a
 //           pinhole has not: the skin's and sclera's cosine is not rounded at the horizon by the sensor's
-//           lens. The glint's lobe is widened by both lenses all the same.
+//           lens. The glint's lobe is widened by both lenses all the same. Light that reaches a spot of the
+//           iris by two ways (sensors beyond 65 degrees off the eye's axis) is all seen.
 // Eye       the analytic surface, found by steps that cannot pass it and a bracketed root; the iris by
 //           Snell's law on the way in. Face: Embree's hits on a mesh of its height field, moved onto the
 //           height field itself.

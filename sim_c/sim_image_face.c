@@ -10,8 +10,8 @@
 #include "sim_face.h"
 
 static const double X_FROM = -34, X_TO = 30, Y_FROM = -32, Y_TO = 32, MESH_STEP = 0.25;
-// Between its corners a triangle lies behind the face by up to 1.2e-3 mm, and a ray that grazes the face would
-// pass: so the mesh stands this far before it. settle() knows better.
+// Between its corners a triangle lies behind the face by up to 1.2e-3 mm, and a ray that grazes the face
+// would pass: so the mesh stands this far before it. settle() knows better.
 static const double MESH_FORWARD = 2e-3;
 // The height field in a table, for horizons: between its nodes a parabola's error is 1e-3 mm at most.
 enum { TABLE_NODES = 1281 };
@@ -37,7 +37,8 @@ static double table_height(const struct sim_image_face *face, double x, double y
     double at[2] = {(x - TABLE_FROM) / TABLE_STEP, (y - TABLE_FROM) / TABLE_STEP};
     int cell[2];
     for (int k = 0; k < 2; ++k) {
-        if (!(at[k] >= 0 && at[k] < TABLE_NODES - 1)) return height_of(&face->person, face->relief_only, x, y);
+        if (!(at[k] >= 0 && at[k] < TABLE_NODES - 1))
+            return height_of(&face->person, face->relief_only, x, y);
         cell[k] = (int)at[k];
         at[k] -= cell[k];
     }
@@ -162,8 +163,8 @@ int sim_image_face_hit(const struct sim_image_face *face, const double from[3], 
         double t = query.ray.tfar, wx, wy, *n = hit->normal;
         t_from = t + 1e-3;
         // The ray leaves the face where it meets a triangle from below.
-        double out = query.hit.Ng_x * direction[0] + query.hit.Ng_y * direction[1] + query.hit.Ng_z * direction[2];
-        if (out * query.hit.Ng_z <= 0 || !settle(face, from, direction, &t)) continue;
+        const double side[3] = {query.hit.Ng_x, query.hit.Ng_y, query.hit.Ng_z};
+        if (sim_dot(side, direction) * side[2] <= 0 || !settle(face, from, direction, &t)) continue;
         for (int k = 0; k < 3; ++k) hit->point[k] = from[k] + t * direction[k];
         slopes(face, hit->point[0], hit->point[1], &wx, &wy);
         double length = sqrt(1 + wx * wx + wy * wy);

@@ -67,7 +67,7 @@ static int fail(char *error, size_t bytes, const char *why) {
 
 // The library stays open for the life of the process: Mesa's threads do not survive being unloaded.
 static void *library(void) {
-    static const char *const names[] = {"libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so", "libOSMesa.dylib"};
+    static const char *const names[] = {"libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"};
     for (size_t i = 0; i < sizeof names / sizeof *names; ++i) {
         void *found = dlopen(names[i], RTLD_NOW | RTLD_LOCAL);
         if (found) return found;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// sim_image.c in a fragment shader, 32-bit floats throughout: one pixel of what a sensor sees of one emitter's
+// sim_image.c in a fragment shader, 32-bit floats throughout: a pixel of what a sensor sees of one emitter's
 // light, as (face, sclera, iris, glint). Written for itself: it shares no code and few methods with the C
 // sources (the face is marched, its shadow on the eye is found on the spot, the light's way into the iris by
 // plain Newton steps). Mesa's rasteriser runs both sides of every condition and leaves only loops early: so
@@ -29,7 +29,7 @@ float soft_step(float t) {
     return t * t * t * (10.0 + t * (6.0 * t - 15.0));
 }
 
-// The face ---------------------------------------------------------------------------------------------------
+// The face ------------------------------------------------------------------------------------------------
 
 float relief(vec2 p) {
     float brow = relief_mm.x * exp(-(p.y - 21.0) * (p.y - 21.0) / 98.0);
@@ -91,7 +91,7 @@ float eye_reach(vec3 direction, vec3 site, float radius) {
     return soft_step(0.5 + horizon(p, d, r, 1e6, true) / (2.0 * r));
 }
 
-// Lids ---------------------------------------------------------------------------------------------------------
+// Lids ----------------------------------------------------------------------------------------------------
 
 // Distances of a place to the upper and lower margin, mm.
 vec2 to_margins(vec3 head, out vec3 radial, out vec3 upward) {
@@ -116,7 +116,7 @@ float open_toward(vec3 head, vec3 toward) {
     return open_straight(mm - hidden) * (1.0 - margin.w * (1.0 - soft_step((mm.x - lash) / margin.y)));
 }
 
-// Light --------------------------------------------------------------------------------------------------------
+// Light ---------------------------------------------------------------------------------------------------
 
 float beam(vec3 away) {
     float c = -dot(lamp_aim, away);
@@ -141,7 +141,7 @@ float fresnel(float c) {
     return (s * s + p * p) / 2.0;
 }
 
-// The eye ------------------------------------------------------------------------------------------------------
+// The eye -------------------------------------------------------------------------------------------------
 
 // Distance from the centre less the surface's there; the surface's outward normal. Eye frame.
 float outside(vec3 p, out vec3 normal) {
@@ -194,8 +194,8 @@ vec2 surface(vec3 p, vec3 normal_eye) {
         vec3 off = cross(normal, h);
         float slope2 = dot(off, off) / (c * c * lobe2);
         if (slope2 <= 30.0)
-            glint = open * beam(away) / (lamp_mm * lamp_mm) * exp(-slope2) / (3.14159265 * lobe2 * c * c * c * c) *
-                    fresnel(dot(away, h)) / (4.0 * facing);
+            glint = open * beam(away) / (lamp_mm * lamp_mm) * exp(-slope2) /
+                    (3.14159265 * lobe2 * c * c * c * c) * fresnel(dot(away, h)) / (4.0 * facing);
     }
     return vec2(sclera, glint);
 }
@@ -221,7 +221,8 @@ float through_cornea(vec3 site, vec3 spot, out vec3 exit) {
         u /= s1;
         v /= s2;
         slope = -q / root;
-        float k1 = 1.0 / s1, k2 = index / s2, bend = u.z + index * v.z, cube = cornea_p / (root * root * root);
+        float k1 = 1.0 / s1, k2 = index / s2, bend = u.z + index * v.z;
+        float cube = cornea_p / (root * root * root);
         vec2 gu = u.xy + u.z * slope, gv = v.xy + v.z * slope, g = gu + index * gv;
         hxx = (1.0 + slope.x * slope.x) * (k1 + k2) - gu.x * gu.x * k1 - gv.x * gv.x * k2 -
               bend * (1.0 / root + q.x * q.x * cube);
@@ -264,7 +265,8 @@ float iris(vec3 near, vec3 ray) {  // near: the ray's place nearest to the eye's
     float r = length(spot.xy);
     if (r < pupil_radius || r > limbus) return 0.0;
     vec3 head = eye_axes * q;
-    float seen = open_toward(head, normalize(camera - head)) * clear * (1.0 - fresnel(cosine)) / (index * index);
+    float seen = open_toward(head, normalize(camera - head)) * clear * (1.0 - fresnel(cosine));
+    seen /= index * index;
     if (seen == 0.0) return 0.0;
     float lit = through_cornea(transpose(eye_axes) * lamp, spot, exit);
     vec3 exit_head = eye_axes * exit, away = normalize(lamp - exit_head);

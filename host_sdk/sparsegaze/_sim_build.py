@@ -31,6 +31,7 @@ SOURCES = (
     "sim_glint_mirror.c",
     "sim_scene.c",
     "sim_image.c",
+    "sim_image_eye.c",
     "sim_image_face.c",
     "sim_osmesa.c",
 )

@@ -28,7 +28,9 @@ class Gaze(click.ParamType):
 @click.command("view")
 @click.argument("headset", type=click.Path(dir_okay=False))
 @click.option("--sensor", type=int, required=True, help="Number of the sensor, from 0.")
-@click.option("--gaze", type=Gaze(), default="0,0", show_default=True, help="Azimuth + temporal, elevation + up, deg.")
+@click.option(
+    "--gaze", type=Gaze(), default="0,0", show_default=True, help="Azimuth + temporal, elevation + up, deg."
+)
 @click.option(
     "--person",
     metavar="FILE|SEED",
@@ -37,7 +39,10 @@ class Gaze(click.ParamType):
 @click.option("--pupil", type=float, default=3.5, show_default=True, help="Diameter, mm.")
 @click.option("--lids", type=float, default=1.0, show_default=True, help="Opening, 0 closed .. 1 open.")
 @click.option(
-    "--emitter", type=int, multiple=True, help="One that is lit; repeatable.  [default: all but the sensor's own]"
+    "--emitter",
+    type=int,
+    multiple=True,
+    help="One that is lit; repeatable.  [default: all but the sensor's own]",
 )
 @click.option(
     "--pixels", type=click.IntRange(16, 4096), default=512, show_default=True, help="Of the image's side."
@@ -50,7 +55,10 @@ class Gaze(click.ParamType):
     help="A pixel is the mean of so many squared points in it: smooth edges. 1 is quicker.",
 )
 @click.option(
-    "--reach", type=click.FloatRange(0.1, 20.0), default=3.0, show_default=True,
+    "--reach",
+    type=click.FloatRange(0.1, 20.0),
+    default=3.0,
+    show_default=True,
     help="The image covers +- so many sigma of the sensor's window.",
 )
 @click.option(
@@ -60,11 +68,26 @@ class Gaze(click.ParamType):
     show_default=True,
     help="64-bit with ray-traced face, or 32-bit in a fragment shader (needs libosmesa6).",
 )
-@click.option("-o", "--output", type=click.Path(dir_okay=False), required=True, help="Picture: .png, .pdf, .svg.")
+@click.option(
+    "-o", "--output", type=click.Path(dir_okay=False), required=True, help="Picture: .png, .pdf or .svg."
+)
 @click.option("--npz", type=click.Path(dir_okay=False), help="Write the linear image, part by part, as well.")
 @json_option
 def view_command(
-    headset, sensor, gaze, person, pupil, lids, emitter, pixels, samples, reach, renderer, output, npz, as_json
+    headset,
+    sensor,
+    gaze,
+    person,
+    pupil,
+    lids,
+    emitter,
+    pixels,
+    samples,
+    reach,
+    renderer,
+    output,
+    npz,
+    as_json,
 ):
     """Draw what one sensor sees of a simulated eye, and what of that makes its signal.
 
@@ -154,7 +177,8 @@ def writable(path):
 
     folder = os.path.dirname(path) or "."
     if not os.path.isdir(folder):
-        raise SceneError(f"there is no folder {folder} to write {os.path.basename(path)} into", "create it first")
+        name = os.path.basename(path)
+        raise SceneError(f"there is no folder {folder} to write {name} into", "create it first")
     if os.path.isdir(path) or not os.access(folder, os.W_OK):
         raise SceneError(f"{path} cannot be written", "choose another place")
 

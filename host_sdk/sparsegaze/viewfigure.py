@@ -18,9 +18,9 @@ _PAPER, _CYAN = "white", "#5fd0ff"
 
 
 class ToneCurve:
-    """Radiance L to brightness 0..1 and back: ((L / (L + m)) * (M + m) / M) ^ (1 / 2.2), where m is the mean of
-    the pixels that show something and M the brightest: linear for the dim, saturating for glints, and M is
-    white (Reinhard's curve with a white point, then the usual gamma of a screen).
+    """Radiance L to brightness 0..1 and back: ((L / (L + m)) * (M + m) / M) ^ (1 / 2.2), where m is the mean
+    of the pixels that show something and M the brightest: linear for the dim, saturating for glints, and M
+    is white (Reinhard's curve with a white point, then the usual gamma of a screen).
     """
 
     GAMMA = 2.2
@@ -89,9 +89,8 @@ def draw_view(figure, seen, headset_name="", person_name="simulated person"):
     _draw_summed(figure, [0.642, 0.418, 0.275, 0.4373], seen, image)
     _draw_parts(figure.add_axes([0.642, 0.185, 0.275, 0.062]), seen)
     name = headset_name + ": what" if headset_name else "What"
-    figure.text(
-        0.055, 0.962, "%s sensor %d sees" % (name, seen.sensor), fontsize=17, color=INK, weight="bold", va="center"
-    )
+    title = "%s sensor %d sees" % (name, seen.sensor)
+    figure.text(0.055, 0.962, title, fontsize=17, color=INK, weight="bold", va="center")
     figure.text(0.055, 0.918, _state(seen, person_name), fontsize=11, color=INK, va="center")
     figure.text(0.055, 0.02, _caption(seen), fontsize=8.8, color="#55616b", linespacing=1.5)
 
@@ -116,7 +115,8 @@ def _caption(seen):
     return (
         "Left: near-infrared radiance, as a pinhole at the sensor sees it; brightness = (L/(L+m) · "
         "(M+m)/M)$^{1/2.2}$, m the mean of what is lit, M the brightest. Ringed: each emitter's glint.\n"
-        "Right: the same times the sensor's Gaussian window and each pixel's solid angle; its sum is the signal. "
+        "Right: the same times the sensor's Gaussian window and each pixel's solid angle; its sum is the "
+        "signal. "
         "%d × %d pixels, %s, linear floats, one reflection."
         % (*seen.window.shape, {"embree": "Embree (float64)", "osmesa": "OSMesa (float32)"}[seen.renderer])
     )
@@ -143,7 +143,8 @@ def _circles(axes, seen, colour, labels):
 
     sigma = seen.sigma_tan
     for k in _CIRCLES:
-        axes.add_patch(Circle((0, 0), k * sigma, fill=False, color=colour, lw=0.9, ls=(0, (5, 4)), alpha=0.85))
+        drawn = dict(color=colour, lw=0.9, ls=(0, (5, 4)), alpha=0.85)
+        axes.add_patch(Circle((0, 0), k * sigma, fill=False, **drawn))
         if labels:
             turn = np.radians(135)
             axes.annotate(
