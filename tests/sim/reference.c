@@ -167,23 +167,37 @@ static void add_sclera(void *context, double theta, double phi, double *out) {
 }
 
 // ---- Iris, seen from one port.
+//
+// Where a port is so low that rays through the cornea fold on the iris, a spot has two paths; the model's is the
+// shorter one (positive Jacobian). Tracing starts from such an end: the caustic is then no singularity.
+enum { SLOTS = 4, STARTS = 40 };
+
+struct seen {  // how one port sees the iris
+    double place[3];  // eye frame
+    int folds, has_last, n_starts;
+    struct ray last;
+    double (*starts)[4];  // spot and crossing of rays to start from, where it folds
+};
+
 struct iris {
     const struct scene *scene;
     const struct world *w;
-    int from, n_others, other[MAX_PORTS];
+    struct seen *seen;  // [ports] of this state
+    int from, n_others, other[MAX_PORTS], all_paths, n_slots;
     double pupil, reach;  // radii: of the pupil, of the clear part of the cornea
-    double places[MAX_PORTS][3];  // eye frame
-    double centre[2];             // of the pupil's image on the cornea
-    double row_phi, row_in, row_out;
-    struct ray last[MAX_PORTS];
-    int has_last[MAX_PORTS];
+    double centre[2];     // of the pupil's image on the cornea, where nothing folds
+    double row, slot[SLOTS][2];
 };
+
+static double determinant(const struct ray *ray) {
+    return ray->jacobian[0] * ray->jacobian[3] - ray->jacobian[1] * ray->jacobian[2];
+}
 
 // Share of one end of a ray: window, Fresnel, veil, lids, face.
 static double end_share(const struct iris *iris, int port, const struct ray *ray) {
     const struct world *w = iris->w;
     const struct ref_port *p = &iris->scene->ports[port];
-    double share = (1 - white(w, hypot(ray->point[0], ray->point[1]))), head[3], away[3];
+    double share = 1 - white(w, hypot(ray->point[0], ray->point[1])), head[3], away[3];
     if (ray->cosine <= 0 || share <= 0) return 0;
     struct lid_place at;
     to_head(w, ray->point, head);
@@ -195,11 +209,58 @@ static double end_share(const struct iris *iris, int port, const struct ray *ray
     return share;
 }
 
+// Whether the rays of a port fold on the iris; if so, the unfolded ones to start from.
+static int prepare_seen(struct seen *seen, const struct world *w) {
+    double reach = w->p.limbus_radius_mm + w->p.limbus_haze_mm / 2, rim = 1.02 * w->p.limbus_radius_mm;
+    if (!(seen->starts = malloc(STARTS * STARTS * sizeof *seen->starts))) return -1;
+    for (int k = 0; k < STARTS * STARTS; ++k) {
+        double x = (2 * (k % STARTS + 0.5) / STARTS - 1) * reach, y = (2 * (k / STARTS + 0.5) / STARTS - 1) * reach;
+        struct ray ray;
+        if (hypot(x, y) > reach || !refract_ray(w, seen->place, x, y, &ray) || ray.cosine < -0.02) continue;
+        if (hypot(ray.spot[0], ray.spot[1]) < rim && determinant(&ray) < 0.03) seen->folds = 1;
+        if (ray.cosine <= 0 || determinant(&ray) <= 0) continue;
+        double start[4] = {ray.spot[0], ray.spot[1], x, y};
+        memcpy(seen->starts[seen->n_starts++], start, sizeof start);
+    }
+    return 0;
+}
+
+static int is_shortest(const struct ray *ray) { return ray->cosine > 0 && determinant(ray) > 0; }
+
+// The shortest path between a port and a spot.
+static int find_path(const struct world *w, struct seen *seen, const double *spot, struct ray *ray) {
+    struct ray *last = &seen->last;
+    int found = 0;
+    if (seen->has_last) {
+        const double *j = last->jacobian;
+        double det = determinant(last), ex = spot[0] - last->spot[0], ey = spot[1] - last->spot[1];
+        double dx = (j[3] * ex - j[1] * ey) / det, dy = (j[0] * ey - j[2] * ex) / det;
+        if (hypot(dx, dy) < 1) found = shoot(w, seen->place, spot, last->point[0] + dx, last->point[1] + dy, ray);
+        if (found && seen->folds && !is_shortest(ray)) found = 0;
+    }
+    if (!found && !seen->folds) found = shoot(w, seen->place, spot, spot[0], spot[1], ray);
+    double after = -1;
+    for (int k = 0; k < 6 && !found; ++k) {  // from the nearest spots whose path is known
+        double nearest = 1e300;
+        int best = -1;
+        for (int i = 0; i < seen->n_starts; ++i) {
+            double d = hypot(seen->starts[i][0] - spot[0], seen->starts[i][1] - spot[1]);
+            if (d > after && d < nearest) nearest = d, best = i;
+        }
+        if (best < 0) break;
+        after = nearest;
+        found = shoot(w, seen->place, spot, seen->starts[best][2], seen->starts[best][3], ray);
+        if (found && seen->folds && !is_shortest(ray)) found = 0;
+    }
+    seen->has_last = found && is_shortest(ray);
+    if (seen->has_last) *last = *ray;
+    return found && is_shortest(ray);
+}
+
 // Where a ray of the cornea, from the pupil's image outward, meets the image of a circle of the iris.
 static double circle_at(const struct iris *iris, double phi, double radius, double guess, double end) {
-    const double *from = iris->places[iris->from];
-    double c = cos(phi), s = sin(phi);
-    double low = 0, high = end, t = guess < end ? guess : end / 2;
+    const double *from = iris->seen[iris->from].place;
+    double c = cos(phi), s = sin(phi), low = 0, high = end, t = guess < end ? guess : end / 2;
     for (int i = 0; i < 80; ++i) {
         struct ray ray;
         double f = 1, slope = 0;
@@ -218,71 +279,102 @@ static double circle_at(const struct iris *iris, double phi, double radius, doub
     return t;
 }
 
-static void iris_row(struct iris *iris, double phi) {
+// Nothing folds: rows are rays of the cornea from the pupil's image, and each has one stretch of iris.
+static void polar_row(struct iris *iris, double phi) {
     // The clear cornea's circle on this ray: |centre + t e| = reach.
     double c = cos(phi), s = sin(phi), b = iris->centre[0] * c + iris->centre[1] * s;
     double miss2 = iris->centre[0] * iris->centre[0] + iris->centre[1] * iris->centre[1] - b * b;
     double half2 = iris->reach * iris->reach - miss2, half = half2 > 0 ? sqrt(half2) : 0;
     double leave = -b + half, enter = fmax(0, -b - half);
-    iris->row_phi = phi;
-    iris->row_in = iris->row_out = 0;
+    iris->n_slots = 0;
     if (half2 <= 0 || leave <= enter) return;
-    double in = circle_at(iris, phi, iris->pupil, iris->pupil, leave), out;
-    out = circle_at(iris, phi, iris->w->p.limbus_radius_mm, leave, leave);
-    iris->row_in = fmax(in, enter);
-    iris->row_out = fmax(out, iris->row_in);
+    iris->slot[0][0] = fmax(circle_at(iris, phi, iris->pupil, iris->pupil, leave), enter);
+    iris->slot[0][1] = circle_at(iris, phi, iris->w->p.limbus_radius_mm, leave, leave);
+    iris->n_slots = iris->slot[0][1] > iris->slot[0][0];
 }
 
-static int find_path(struct iris *iris, int port, const double *spot, struct ray *ray) {
-    const double *from = iris->places[port];
-    struct ray *last = &iris->last[port];
-    int found = 0;
-    if (iris->has_last[port]) {
-        const double *j = last->jacobian;
-        double det = j[0] * j[3] - j[1] * j[2], ex = spot[0] - last->spot[0], ey = spot[1] - last->spot[1];
-        double dx = (j[3] * ex - j[1] * ey) / det, dy = (j[0] * ey - j[2] * ex) / det;
-        if (hypot(dx, dy) < 2) found = shoot(iris->w, from, spot, last->point[0] + dx, last->point[1] + dy, ray);
-        if (!found) found = shoot(iris->w, from, spot, last->point[0], last->point[1], ray);
-    }
-    if (!found) found = shoot(iris->w, from, spot, spot[0], spot[1], ray);
-    for (int k = 0; k < 49 && !found; ++k) {
-        double x = (k % 7 - 3) * 2.0, y = (k / 7 - 3) * 2.0;
-        found = shoot(iris->w, from, spot, x, y, ray);
-    }
-    if (found) *last = *ray;
-    iris->has_last[port] = found;
-    return found;
+// Whether the ray through (x, y) counts and meets the iris.
+static int kind_at(const struct iris *iris, double x, double y) {
+    struct ray ray;
+    if (!refract_ray(iris->w, iris->seen[iris->from].place, x, y, &ray) || ray.cosine <= 0) return 0;
+    double r = hypot(ray.spot[0], ray.spot[1]);
+    if (!iris->all_paths && determinant(&ray) <= 0) return 0;
+    return r > iris->pupil && r < iris->w->p.limbus_radius_mm;
 }
 
-static void add_iris(void *context, double t, double phi, double *out) {
+// Something folds: rows are parallel lines, with up to SLOTS stretches of iris each, found by stepping.
+static void line_row(struct iris *iris, double y) {
+    enum { STEPS = 160 };
+    double half = sqrt(iris->reach * iris->reach - y * y), last = -half;
+    const double *place = iris->seen[iris->from].place;
+    double along[2] = {place[0] / hypot(place[0], place[1]), place[1] / hypot(place[0], place[1])};
+    int was = 0;
+    iris->n_slots = 0;
+    for (int i = 0; i <= STEPS; ++i) {
+        double x = -half * cos(PI * i / STEPS);
+        int is = i < STEPS && kind_at(iris, x * along[0] - y * along[1], x * along[1] + y * along[0]);
+        if (is != was) {
+            double low = last, high = x;
+            for (int k = 0; k < 48; ++k) {
+                double mid = (low + high) / 2;
+                int here = kind_at(iris, mid * along[0] - y * along[1], mid * along[1] + y * along[0]);
+                if (here == was) low = mid;
+                else high = mid;
+            }
+            if (is && iris->n_slots == SLOTS) return;
+            if (is) iris->slot[iris->n_slots][0] = iris->slot[iris->n_slots][1] = high;
+            else iris->slot[iris->n_slots++][1] = low;
+        }
+        was = is;
+        last = x;
+    }
+}
+
+static void add_iris(void *context, double t, double row, double *out) {
     struct iris *iris = context;
     const struct world *w = iris->w;
+    struct seen *from = &iris->seen[iris->from];
     struct ray ray, back;
-    if (phi != iris->row_phi) iris_row(iris, phi);
-    double length = iris->row_out - iris->row_in, r = iris->row_in + t * length;
-    if (length <= 0) return;
-    if (!refract_ray(w, iris->places[iris->from], iris->centre[0] + r * cos(phi), iris->centre[1] + r * sin(phi), &ray))
-        return;
-    double n = w->p.refractive_index, weight = end_share(iris, iris->from, &ray);
+    if (row != iris->row) {
+        if (from->folds) line_row(iris, row);
+        else polar_row(iris, row);
+        iris->row = row;
+    }
+    int slot = (int)t;
+    if (slot >= iris->n_slots) return;
+    double length = iris->slot[slot][1] - iris->slot[slot][0], r = iris->slot[slot][0] + (t - slot) * length;
+    double x = iris->centre[0] + r * cos(row), y = iris->centre[1] + r * sin(row), weight = length * r;
+    if (from->folds) {
+        double far = hypot(from->place[0], from->place[1]), c = from->place[0] / far, s = from->place[1] / far;
+        x = r * c - row * s, y = r * s + row * c, weight = length;
+    }
+    if (!refract_ray(w, from->place, x, y, &ray)) return;
+    double n = w->p.refractive_index;
+    weight *= w->p.albedo_iris / (PI * n * n) * ray.solid * end_share(iris, iris->from, &ray);
     if (weight <= 0) return;
-    weight *= w->p.albedo_iris / (PI * n * n) * ray.solid * length * r;
     for (int i = 0; i < iris->n_others; ++i) {
-        int port = iris->other[i];
-        if (!find_path(iris, port, ray.spot, &back)) continue;
-        const double *j = back.jacobian;
-        double det = j[0] * j[3] - j[1] * j[2];
-        if (det > 0) out[i] = weight * end_share(iris, port, &back) * back.solid / det;
+        struct seen *to = &iris->seen[iris->other[i]];
+        if (find_path(w, to, ray.spot, &back))
+            out[i] = weight * end_share(iris, iris->other[i], &back) * back.solid / determinant(&back);
     }
 }
 
-static int prepare_iris(struct iris *iris) {
+static void start_iris(struct iris *iris, struct cubature *c) {
     const double centre[2] = {0, 0};
+    struct seen *from = &iris->seen[iris->from];
+    iris->row = 1e9;
+    if (from->folds) {
+        cubature_grid(c, 0, SLOTS, SLOTS, -iris->reach, iris->reach, 6);
+        return;
+    }
     struct ray ray;
-    if (!find_path(iris, iris->from, centre, &ray)) return 0;
+    int found = shoot(iris->w, from->place, centre, 0, 0, &ray);
+    for (int k = 0; k < from->n_starts && !found; ++k)
+        found = shoot(iris->w, from->place, centre, from->starts[k][2], from->starts[k][3], &ray);
+    if (!found) return;
     iris->centre[0] = ray.point[0];
     iris->centre[1] = ray.point[1];
-    iris->row_phi = -1;
-    return 1;
+    cubature_grid(c, 0, 1, 1, 0, 2 * PI, 4);
 }
 
 // ---- Glint of one pair.
@@ -406,7 +498,13 @@ static struct job *new_job(struct job ***jobs, int *n_jobs, int state, int term,
     return job->slot && job->value && job->error ? job : NULL;
 }
 
-static int open_jobs(const struct scene *scene, const double *states, int terms, struct job ***jobs, int *n_jobs) {
+// The end to trace from: the sensor's, unless only the emitter's rays fold.
+static int iris_from(const int *pair, const struct seen *seen) {
+    return pair[seen[pair[1]].folds && !seen[pair[0]].folds];
+}
+
+static int open_jobs(const struct scene *scene, const double *states, int terms, struct seen *all_seen,
+                     struct job ***jobs, int *n_jobs) {
     int np = scene->n_pairs;
     struct job *job;
     if (terms & 1) {
@@ -431,21 +529,26 @@ static int open_jobs(const struct scene *scene, const double *states, int terms,
             cubature_grid(&job->cubature, from, 1.2, 4, 0, 2 * PI, 8);
             cubature_grid(&job->cubature, 1.2, PI, 3, 0, 2 * PI, 8);
         }
-        for (int k = 0; k < scene->n_ports && terms & 4; ++k) {
+        struct seen *seen = terms & 4 ? &all_seen[s * scene->n_ports] : NULL;
+        for (int k = 0; k < scene->n_ports && seen; ++k) {
+            to_eye(w, scene->ports[k].position, seen[k].place);
+            if (prepare_seen(&seen[k], w)) return -1;
+        }
+        for (int k = 0; k < scene->n_ports && seen; ++k) {
             int n = 0;
-            for (int i = 0; i < np; ++i) n += scene->pair[i][0] == k;
+            for (int i = 0; i < np; ++i) n += iris_from(scene->pair[i], seen) == k;
             if (!n) continue;
             if (!(job = new_job(jobs, n_jobs, s, 2, n, add_iris))) return -1;
             struct iris *iris = &job->context.iris;
-            iris->scene = scene, iris->w = w, iris->from = k, iris->pupil = states[4 * s + 2] / 2;
+            *iris = (struct iris){.scene = scene, .w = w, .seen = seen, .from = k, .all_paths = (terms & 16) != 0};
+            iris->pupil = states[4 * s + 2] / 2;
             iris->reach = w->p.limbus_radius_mm + w->p.limbus_haze_mm / 2;
-            for (int i = 0; i < scene->n_ports; ++i) to_eye(w, scene->ports[i].position, iris->places[i]);
             for (int i = 0; i < np; ++i) {
-                if (scene->pair[i][0] != k) continue;
+                if (iris_from(scene->pair[i], seen) != k) continue;
                 job->slot[iris->n_others] = base + 2 * np + i;
-                iris->other[iris->n_others++] = scene->pair[i][1];
+                iris->other[iris->n_others++] = scene->pair[i][scene->pair[i][0] == k];
             }
-            if (prepare_iris(iris)) cubature_grid(&job->cubature, 0, 1, 1, 0, 2 * PI, 4);
+            start_iris(iris, &job->cubature);
         }
         for (int i = 0; i < np && terms & 8; ++i) {
             if (!(job = new_job(jobs, n_jobs, s, 3, 1, add_glint))) return -1;
@@ -465,8 +568,9 @@ int ref_evaluate(const struct ref_person *person, const struct ref_port *sensors
     if (n_sensors + n_emitters > MAX_PORTS || n_pairs > MAX_PAIRS || n_states > 16) return -1;
     struct world worlds[16];
     struct scene *scene = calloc(1, sizeof *scene);
+    struct seen *seen = calloc((size_t)(n_states * (n_sensors + n_emitters)), sizeof *seen);
     struct job **jobs = NULL;
-    int n_jobs = 0, bad = !scene;
+    int n_jobs = 0, bad = !scene || !seen;
     for (int s = 0; s < n_states; ++s) {
         worlds[s].p = *person;
         world_eye(&worlds[s], states[4 * s], states[4 * s + 1]);
@@ -486,7 +590,7 @@ int ref_evaluate(const struct ref_person *person, const struct ref_port *sensors
         }
         for (int i = 0; i < n_pairs; ++i)
             scene->pair[i][0] = pairs[2 * i], scene->pair[i][1] = n_sensors + pairs[2 * i + 1];
-        bad = open_jobs(scene, states, terms, &jobs, &n_jobs);
+        bad = open_jobs(scene, states, terms, seen, &jobs, &n_jobs);
     }
     memset(value, 0, (size_t)(4 * n_states * n_pairs) * sizeof *value);
     memset(error, 0, (size_t)(4 * n_states * n_pairs) * sizeof *error);
@@ -519,6 +623,8 @@ int ref_evaluate(const struct ref_person *person, const struct ref_port *sensors
         free(jobs[k]->slot), free(jobs[k]->value), free(jobs[k]->error);
         free(jobs[k]);
     }
+    for (int k = 0; seen && k < n_states * (n_sensors + n_emitters); ++k) free(seen[k].starts);
+    free(seen);
     free(jobs);
     free(scene);
     return bad ? -1 : 0;
@@ -527,4 +633,17 @@ int ref_evaluate(const struct ref_person *person, const struct ref_port *sensors
 double ref_face_mm(const struct ref_person *person, double x, double y) {
     struct world w = {.p = *person};
     return face(&w, x, y);
+}
+
+double ref_iris_light(const struct ref_person *person, const double *site, const double *spot, double *exit) {
+    struct world w = {.p = *person};
+    struct seen seen = {.place = {site[0], site[1], site[2]}};
+    struct ray ray;
+    world_eye(&w, 0, 0);
+    if (prepare_seen(&seen, &w)) return -1;
+    int found = find_path(&w, &seen, spot, &ray);
+    free(seen.starts);
+    if (!found) return 0;
+    memcpy(exit, ray.point, sizeof ray.point);
+    return ray.solid / determinant(&ray) * (1 - fresnel(person->refractive_index, ray.cosine));
 }

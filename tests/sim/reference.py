@@ -33,6 +33,7 @@ int ref_evaluate(const struct ref_person *person, const struct ref_port *sensors
                  int n_pairs, const double *states, int n_states, int terms, double tol, double scale,
                  double *value, double *error, long *points);
 double ref_face_mm(const struct ref_person *person, double x, double y);
+double ref_iris_light(const struct ref_person *person, const double *site, const double *spot, double *exit);
 """
 )
 _loaded = None
@@ -89,6 +90,16 @@ def face_mm(person, x_mm, y_mm):
     return lib.ref_face_mm(_c_person(ffi, person), x_mm, y_mm)
 
 
+def iris_light(person, site_mm, spot_mm):
+    """(irradiance of a spot (x, y) of the iris per intensity at a site, 1/mm^2; where the light crosses the
+    cornea), eye frame, along the shortest path; 0 when there is none.
+    """
+    ffi, lib = _library()
+    exit_mm = ffi.new("double[3]")
+    spot, site = ffi.new("double[2]", list(spot_mm)), ffi.new("double[3]", list(site_mm))
+    return lib.ref_iris_light(_c_person(ffi, person), site, spot, exit_mm), tuple(exit_mm)
+
+
 def all_pairs(headset):
     """Every (sensor, emitter), in the order of a flattened [sensor, emitter] array."""
     return [(s, e) for s in range(len(headset.sensors)) for e in range(len(headset.emitters))]
@@ -104,13 +115,15 @@ def other_pairs(headset):
     return apart or all_pairs(headset)
 
 
-def reference_states(headset, person, states, pairs=None, tol=3e-6, terms=TERMS, scale=None, slip_mm=(0, 0, 0)):
+def reference_states(headset, person, states, pairs=None, tol=3e-6, terms=TERMS, scale=None, slip_mm=(0, 0, 0),
+                     all_paths=False):
     """Every term at several states of one scene, which share the face's work.
 
     states   [(azimuth_deg, elevation_deg, pupil_mm, lid_opening)], at most 16
     pairs    [(sensor, emitter)], default all
     tol      goal of each term's own error estimate, of the mean total over the pairs of two different places
              at that state (or of `scale`, an absolute response)
+    all_paths  also the longer path of two between a very oblique port and the iris, at the end that folds
     Returns ({term: array [state, pair]}, {term: error estimates alike}, {term: integrand evaluations}).
     """
     ffi, lib = _library()
@@ -138,7 +151,7 @@ def reference_states(headset, person, states, pairs=None, tol=3e-6, terms=TERMS,
         len(pairs),
         ffi.new("double[]", flat),
         len(states),
-        sum(1 << TERMS.index(term) for term in terms),
+        sum(1 << TERMS.index(term) for term in terms) + (16 if all_paths else 0),
         tol,
         scale or 0.0,
         ffi.from_buffer("double[]", value),
