@@ -51,7 +51,9 @@ def _hard():
     )
     yield Case(
         "sensor 5 mm from the eye",
-        _apart("near", [port((4.0, -3.0, -17.4), (0.0, 0.0, -12.0), 25.0, 0.5)], ring.emitters[3:5] + (side,)),
+        _apart(
+            "near", [port((4.0, -3.0, -17.4), (0.0, 0.0, -12.0), 25.0, 0.5)], ring.emitters[3:5] + (side,)
+        ),
         nominal,
         ((5.0, 2.0, 3.5, 1.0), (-12.0, 6.0, 5.0, 1.0)),
     )
@@ -75,11 +77,16 @@ def _hard():
     )
     yield Case(
         "tangent sensor",
-        _apart("tangent", [port((27.0, 1.0, -13.2), (2.0, 0.0, -11.5), 20.0, 1.0)], ring.emitters[3:] + (side,)),
+        _apart(
+            "tangent", [port((27.0, 1.0, -13.2), (2.0, 0.0, -11.5), 20.0, 1.0)], ring.emitters[3:] + (side,)
+        ),
         nominal,
         ((0.0, 0.0, 3.5, 1.0), (22.0, 5.0, 3.5, 1.0), (-22.0, -5.0, 5.0, 1.0)),
     )
-    nose = [port((-43.0, -3.0, -21.6), (0, 0, -11.5), 15.0, 1.5), port((-40, 4, -22.5), (0, 0, -11.5), 15.0, 0.0)]
+    nose = [
+        port((-43.0, -3.0, -21.6), (0, 0, -11.5), 15.0, 1.5),
+        port((-40, 4, -22.5), (0, 0, -11.5), 15.0, 0.0),
+    ]
     yield Case(
         "nose between sensor and eye",
         _apart("nasal", nose, [side, port((-14, -6, -28), (-2, 0, -11), 20.0, 1.5)]),
@@ -110,7 +117,9 @@ def _draw_port(rng, person):
             for dx, dy in ((0, 0), (2, 0), (-2, 0), (0, 2), (0, -2))
         )
         if clear and distance > 15.5 + 2 * radius:
-            return port(np.round(at + person.eye_position_mm, 3), np.add(aim, person.eye_position_mm), sigma, radius)
+            return port(
+                np.round(at + person.eye_position_mm, 3), np.add(aim, person.eye_position_mm), sigma, radius
+            )
 
 
 def _draw(seed):

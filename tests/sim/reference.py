@@ -14,7 +14,9 @@ from cffi import FFI
 
 HERE = Path(__file__).resolve().parent
 BUILT = HERE.parent.parent / "build" / "reference"
-SOURCES = ("reference.c", "reference_world.c", "reference_cubature.c")
+SOURCES = tuple(
+    "reference%s.c" % part for part in ("", "_cubature", "_world", "_surfaces", "_iris", "_glint")
+)
 TERMS = ("face", "sclera", "iris", "glint")
 
 PERSON = (
@@ -24,9 +26,7 @@ PERSON = (
     " lid_close_at lid_thickness_mm lid_softness_mm lid_radius_mm brow_mm nose_mm cheek_mm lash_length_mm"
     " lash_opacity"
 ).split()
-DECLARED = (
-    "struct ref_person { double %s; };" % ", ".join(PERSON)
-    + """
+DECLARED = "struct ref_person { double %s; };" % ", ".join(PERSON) + """
 struct ref_port { double position[3], aim[3], sigma_deg, radius_mm; };
 int ref_evaluate(const struct ref_person *person, const struct ref_port *sensors, int n_sensors,
                  const struct ref_port *emitters, int n_emitters, const int *pairs, const int *counts,
@@ -35,7 +35,6 @@ int ref_evaluate(const struct ref_person *person, const struct ref_port *sensors
 double ref_face_mm(const struct ref_person *person, double x, double y);
 double ref_iris_light(const struct ref_person *person, const double *site, const double *spot, double *exit);
 """
-)
 _loaded = None
 
 
@@ -115,8 +114,9 @@ def other_pairs(headset):
     return apart or all_pairs(headset)
 
 
-def reference_states(headset, person, states, pairs=None, tol=3e-6, terms=TERMS, scale=None, slip_mm=(0, 0, 0),
-                     all_paths=False):
+def reference_states(
+    headset, person, states, pairs=None, tol=3e-6, terms=TERMS, scale=None, slip_mm=(0, 0, 0), all_paths=False
+):
     """Every term at several states of one scene, which share the face's work.
 
     states   [(azimuth_deg, elevation_deg, pupil_mm, lid_opening)], at most 16

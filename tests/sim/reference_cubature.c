@@ -2,9 +2,9 @@
 //
 // Globally adaptive cubature of a vector of functions over rectangles: in every cell the tensor product of
 // Gauss-Kronrod's 7 and 15 points; the cell with the greatest error of any component is halved across the
-// axis along which the two rules differ more, until the summed errors of all components meet a goal. The error
-// of a cell is the sum over both axes of |Kronrod - Gauss| along it: Kronrod's own error is far smaller where
-// the function is smooth. Included by reference.c.
+// axis along which the two rules differ more, until the summed errors of all components meet a goal. The
+// error of a cell is the sum over both axes of |Kronrod - Gauss| along it: Kronrod's own error is far smaller
+// where the function is smooth. Included by reference.c.
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
@@ -35,8 +35,9 @@ static const double KRONROD_WEIGHT[8] = {
     0.104790010322250183839876322541518, 0.140653259715525918745189590510238,
     0.169004726639267902826583426598550, 0.190350578064785409913256402421014,
     0.204432940075298892414161999234649, 0.209482141084727828012999174891714};
-static const double GAUSS_WEIGHT[4] = {0.129484966168869693270611432679082, 0.279705391489276667901467771423780,
-                                       0.381830050505118944950369775488975, 0.417959183673469387755102040816327};
+static const double GAUSS_WEIGHT[4] = {
+    0.129484966168869693270611432679082, 0.279705391489276667901467771423780,
+    0.381830050505118944950369775488975, 0.417959183673469387755102040816327};
 
 static double node(int i, double *kronrod, double *gauss) {
     int k = i < 8 ? i : 14 - i;
@@ -177,7 +178,8 @@ static void cubature_run(struct cubature *c, double goal, int max_cells, double 
             free(cell.part);
             double hx = cell.half_x, hy = cell.half_y;
             for (int side = -1; side <= 0; ++side) {
-                double x = cell.x + (cell.along_y ? -hx : side * hx), y = cell.y + (cell.along_y ? side * hy : -hy);
+                double x = cell.x + (cell.along_y ? -hx : side * hx),
+                       y = cell.y + (cell.along_y ? side * hy : -hy);
                 cubature_add(c, x, x + (cell.along_y ? 2 * hx : hx), y, y + (cell.along_y ? hy : 2 * hy));
             }
         }

@@ -77,7 +77,10 @@ def main():
     parse.add_argument("--quality", type=float, default=1.0)
     args = parse.parse_args()
     parts = TERMS + ("diffuse", "total")
-    print("%-28s %s  ref est (max)  ref s  sim s" % ("rms/max, share of mean", " ".join("%-15s" % p for p in parts)))
+    print(
+        "%-28s %s  ref est (max)  ref s  sim s"
+        % ("rms/max, share of mean", " ".join("%-15s" % p for p in parts))
+    )
     quality = {term: args.quality for term in ("sclera", "iris", "glint", "face")}
     for case in random_scenes(args.scenes):
         if args.only not in case.name:

@@ -2,9 +2,13 @@
 //
 // What the reference knows of the world, written anew from the model's words: the eye's surface, its turning,
 // the lids, the face, its soft horizon, Snell's law. Shares no line with sim_c. Included by reference.c.
-static double step5(double t) { return t <= 0 ? 0 : t >= 1 ? 1 : t * t * t * (10 - 15 * t + 6 * t * t); }
+static double step5(double t) {
+    return t <= 0 ? 0 : t >= 1 ? 1 : t * t * t * (10 - 15 * t + 6 * t * t);
+}
 
-static double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+static double dot(const double *a, const double *b) {
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
 
 static double toward(const double *from, const double *to, double *unit) {
     for (int k = 0; k < 3; ++k) unit[k] = to[k] - from[k];
@@ -15,7 +19,7 @@ static double toward(const double *from, const double *to, double *unit) {
 
 struct world {
     struct ref_person p;
-    double apex, iris_z, conic;  // conic = 1 + Q
+    double apex, iris_z, conic;              // conic = 1 + Q
     double axis_x[3], axis_y[3], axis_z[3];  // of the eye, head frame
     double lid_up, lid_low, lid_half;        // margins at alpha = 0, half width, radians
 };
@@ -72,7 +76,8 @@ static void world_lids(struct world *w, double elevation_deg, double opening) {
 }
 
 static void to_head(const struct world *w, const double *eye, double *head) {
-    for (int k = 0; k < 3; ++k) head[k] = eye[0] * w->axis_x[k] + eye[1] * w->axis_y[k] + eye[2] * w->axis_z[k];
+    for (int k = 0; k < 3; ++k)
+        head[k] = eye[0] * w->axis_x[k] + eye[1] * w->axis_y[k] + eye[2] * w->axis_z[k];
 }
 
 static void to_eye(const struct world *w, const double *head, double *eye) {
@@ -84,7 +89,8 @@ static void to_eye(const struct world *w, const double *head, double *eye) {
 // Radius of the outside at an angle from the axis, and its slope: the larger of conic and globe, with a cubic
 // round where they are within limbus_blend_mm of each other.
 static double profile(const struct world *w, double theta, double *slope) {
-    double c = cos(theta), s = sin(theta), big = w->p.cornea_radius_mm, q = w->conic, blend = w->p.limbus_blend_mm;
+    double c = cos(theta), s = sin(theta), big = w->p.cornea_radius_mm, q = w->conic,
+           blend = w->p.limbus_blend_mm;
     // On the ray (t s, t c): (t s)^2 = 2 big (apex - t c) - q (apex - t c)^2.
     double aa = s * s + q * c * c, half = c * (big - q * w->apex), rest = w->apex * (q * w->apex - 2 * big);
     double t = (-half + sqrt(half * half - aa * rest)) / aa;
@@ -164,8 +170,8 @@ static double face_slope(const struct world *w, double x, double y, int along_y)
     return (8 * (d[2] - d[1]) - (d[3] - d[0])) / (12 * h);
 }
 
-// The soft horizon: least of gap(u) / u along P + u (Q - P), u in 0..1, or below -floor_mm, or above floor_mm,
-// whatever it is then. start = the limit at u = 0.
+// The soft horizon: least of gap(u) / u along P + u (Q - P), u in 0..1, or below -floor_mm, or above
+// floor_mm, whatever it is then. start = the limit at u = 0.
 static double gap_per_u(const struct world *w, int bare, const double *p, const double *d, double u) {
     double x = p[0] + u * d[0], y = p[1] + u * d[1];
     return (-(p[2] + u * d[2]) - (bare ? relief(w, x, y) : face(w, x, y))) / u;
@@ -203,12 +209,16 @@ static double horizon(const struct world *w, int bare, const double *p, const do
                     next = b - at > at - a ? at + 0.382 * (b - at) : at - 0.382 * (at - a);
                 double value = gap_per_u(w, bare, p, d, next), old = best;
                 if (value < best) {
-                    if (next > at) a = at;
-                    else b = at;
+                    if (next > at)
+                        a = at;
+                    else
+                        b = at;
                     x1 = x2, v1 = v2, x2 = at, v2 = best, at = next, best = value;
                 } else {
-                    if (next > at) b = next;
-                    else a = next;
+                    if (next > at)
+                        b = next;
+                    else
+                        a = next;
                     x1 = x2, v1 = v2, x2 = next, v2 = value;
                 }
                 if (k > 3 && fabs(old - value) < 1e-10) break;
@@ -217,8 +227,7 @@ static double horizon(const struct world *w, int bare, const double *p, const do
         }
         // All that is left lies below `top`: nothing there can come lower.
         double height = -(p[2] + u[2] * d[2]) - top;
-        if (-d[2] > 0 && height > 0 && height / u[2] > fmin(least, floor_mm) && i > 1 &&
-            -p[2] < top) break;
+        if (-d[2] > 0 && height > 0 && height / u[2] > fmin(least, floor_mm) && i > 1 && -p[2] < top) break;
     }
     return least;
 }
@@ -247,7 +256,8 @@ struct ray {
 };
 
 static int refract_ray(const struct world *w, const double *from, double x, double y, struct ray *ray) {
-    double big = w->p.cornea_radius_mm, root2 = big * big - w->conic * (x * x + y * y), n = w->p.refractive_index;
+    double big = w->p.cornea_radius_mm, root2 = big * big - w->conic * (x * x + y * y),
+           n = w->p.refractive_index;
     if (root2 <= 0.02 * big * big) return 0;
     double root = sqrt(root2), *q = ray->point, u[3], normal[3], size = sqrt(x * x + y * y + root2);
     q[0] = x, q[1] = y, q[2] = w->apex - sag(w, x * x + y * y);
