@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulator's judge: every term of a response by adaptive cubature of the model as it is written, in code,
-parametrisation and quadrature that share nothing with sim_c. See reference.c. Needs only a C compiler.
+"""The simulator's judge: every term of a response by adaptive cubature of the model as it is written, in
+code, parametrisation and quadrature that share nothing with sim_c. See reference.c. Needs only a C compiler.
 """
 
 import hashlib
@@ -21,9 +21,9 @@ TERMS = ("face", "sclera", "iris", "glint")
 
 PERSON = (
     "cornea_radius_mm cornea_asphericity limbus_radius_mm limbus_blend_mm limbus_haze_mm globe_radius_mm"
-    " iris_depth_mm kappa_azimuth_deg kappa_elevation_deg refractive_index roughness albedo_sclera albedo_iris"
-    " albedo_skin lid_upper_deg lid_lower_deg canthus_deg canthus_tilt_deg lid_upper_follow lid_lower_follow"
-    " lid_close_at lid_thickness_mm lid_softness_mm lid_radius_mm brow_mm nose_mm cheek_mm lash_length_mm"
+    " iris_depth_mm kappa_azimuth_deg kappa_elevation_deg refractive_index roughness albedo_sclera"
+    " albedo_iris albedo_skin lid_upper_deg lid_lower_deg canthus_deg canthus_tilt_deg lid_upper_follow"
+    " lid_lower_follow lid_close_at lid_thickness_mm lid_softness_mm lid_radius_mm brow_mm nose_mm cheek_mm lash_length_mm"
     " lash_opacity"
 ).split()
 DECLARED = "struct ref_person { double %s; };" % ", ".join(PERSON) + """

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulator against reference, scene by scene: python tests/sim/reference_table.py [--scenes 20] [--tol 3e-6]
 
-Errors as shares of the scene's mean total response; per scene rms and max of face, sclera, iris, glint, diffuse
-and total, the reference's own estimates and both sides' CPU seconds.
+Errors as shares of the scene's mean total response; per scene rms and max of face, sclera, iris, glint,
+diffuse and total, the reference's own estimates and both sides' CPU seconds.
 """
 
 import argparse

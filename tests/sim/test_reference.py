@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reference (reference.py) judged by closed forms, by itself and by an image; then the simulator by it."""
+"""The reference (reference.py) judged by closed forms, by itself and by an image; then the simulator."""
 
 from dataclasses import replace
 
@@ -80,7 +80,7 @@ def test_the_glint_of_a_sphere_is_that_of_a_convex_mirror():
 
 @pytest.mark.parametrize("site", [(12.0, -8.0, 16.0), (3.0, 2.0, 40.0), (-29.035, 6.325, 4.602)])
 def test_light_reaches_the_iris_on_fermats_path(site):
-    """Moving the crossing to and fro makes the path longer; the site beside the eye is one whose rays fold."""
+    """Moving the crossing to and fro makes the path longer; rays from the site beside the eye fold."""
     person = draw_person(0)
     conic, radius, n = 1 + person.cornea_asphericity, person.cornea_radius_mm, person.refractive_index
     reached = 0
