@@ -14,6 +14,8 @@ import numpy as np
 
 from . import mapplan
 from .mapcall import calls
+from .mapjudge import bend, counted_pairs, hardest, mean_response, scale_of
+from .mapneed import Chosen, may_see
 from .scene import Scene
 
 TERMS = ("face", "sclera", "iris", "glint")
@@ -24,6 +26,7 @@ SHARE, SHARE_BETWEEN = 0.35, 0.3
 SAFETY = 3.0
 PEAK = 10.0  # an error at one gaze may be this many times the tolerance
 FIRST_NODES, MOST_NODES = 9, 129
+NEGLIGIBLE = 0.01  # part of the tolerance below which a term of a port is not computed at all
 WORTH = 0.6  # interpolation is dropped when its points are more than this part of the map's gazes
 ROUNDS = 3
 PROGRESS = {"face": 0.02, "sclera": 0.3, "iris": 0.28, "glint": 0.4}  # part of a map's work, roughly
@@ -81,7 +84,8 @@ class Making:
 
     def bound(self, parts):
         """Bound of the error at any gaze, [state, sensor, emitter]."""
-        return sum(SAFETY * self.errors[term] * scale_of(parts[term].max((3, 4))) for term in TERMS)
+        seen = sum(SAFETY * self.errors[term] * scale_of(parts[term].max((3, 4))) for term in TERMS)
+        return seen + sum(self._unseen.values())
 
     def _rms(self, error):
         """Over the pairs that count (its last two axes) and everything else."""
@@ -109,6 +113,33 @@ class Making:
         for term in TERMS:
             self._settle(term, self.pilot.choose(term, SHARE * self.tol * self.mean, self._rms))
         self._permit_mirror()
+        self._leave_out()
+
+    def _leave_out(self):
+        """Find the ports that provably see nothing of a term."""
+        self._chosen, self._unseen = {}, {}
+        reach = max(np.abs(self.azimuth).max(), np.abs(self.elevation).max())
+        bounds = [
+            may_see(self.headset, self.person, s, reach, self.pupil) for s in np.unique(self.slip, axis=0)
+        ]
+        for term in TERMS[1:]:
+            bound = np.max([some[term] for some in bounds], axis=0)
+            least = NEGLIGIBLE * self.tol * self.mean
+            sensors = np.flatnonzero(bound.max(1) > least)
+            emitters = np.flatnonzero(bound.max(0) > least)
+            if len(sensors) == bound.shape[0] and len(emitters) == bound.shape[1]:
+                continue
+            kept = np.zeros(bound.shape, bool)
+            kept[np.ix_(sensors, emitters)] = True
+            self._chosen[term], self._unseen[term] = (sensors, emitters), np.where(kept, 0.0, bound)
+            self._notes["no " + term] = (
+                "%s: left out for %s, whose windows show none of it; at most %.0e of the mean"
+                % (
+                    term,
+                    _of_ports(self.pairs, sensors, emitters),
+                    self._unseen[term].max() / self.mean,
+                )
+            )
 
     def _settle(self, term, rung):
         self.rung[term], self.quality[term] = rung, mapplan.fineness(term, rung)
@@ -150,15 +181,17 @@ class Making:
 
     # terms -------------------------------------------------------------------------------------------------
 
-    def _scene(self, slip, finer=False):
-        key = tuple(slip), finer
+    def _scene(self, slip, term, finer=False):
+        chosen = self._chosen.get(term)
+        key = tuple(slip), term if chosen else "", finer
         if key not in self._scenes:
             quality = dict(self.quality)
             if finer:
-                for term in ("sclera", "iris", "glint"):
-                    quality[term] = mapplan.fineness(term, self.rung[term] + mapplan.FINER)
+                for name in TERMS[1:]:
+                    quality[name] = mapplan.fineness(name, self.rung[name] + mapplan.FINER)
                 quality.pop("tolerance", None)
-            self._scenes[key] = Scene(self.headset, self.person, slip, quality)
+            scene = self.headset, self.person, slip, quality
+            self._scenes[key] = Chosen(*scene, *chosen) if chosen else Scene(*scene)
         return self._scenes[key]
 
     def _term(self, term):
@@ -170,10 +203,12 @@ class Making:
             members = np.flatnonzero((self.slip == slip).all(1))
             if term != "face":
                 members = members[self.lid[members] > 0]  # closed lids hide the eye: exactly nothing
+            if not all(len(ports) for ports in self._chosen.get(term, [[0]])):
+                continue
             groups = calls(self.pupil, self.lid, members, term)
             for call in groups:
                 part = PROGRESS[term] / len(slips) / len(groups)
-                out[call.members] = self._values(self._scene(slip), call, part)
+                out[call.members] = self._values(self._scene(slip, term), call, part)
                 self._base += part
         return out
 
@@ -265,20 +300,22 @@ class Making:
             chosen.update(hardest(rough, self.azimuth, self.elevation, 3 + min(12, len(self.pupil) // 2)))
         chosen = sorted(chosen)
 
+        terms = [t for t in TERMS[1:] if all(len(ports) for ports in self._chosen.get(t, [[0]]))]
+        for slip in {tuple(self.slip[place[0]]) for place in chosen}:
+            for term in terms:
+                self._scene(slip, term, finer=True)
+
         def finer(place):
             state, row, column = place
-            scene = self._scene(self.slip[state], finer=True)
-            gaze = self.azimuth[column], self.elevation[row]
+            gaze = self.azimuth[column], self.elevation[row], self.pupil[state], self.lid[state]
             return [
-                mapplan.term_value(scene, term, *gaze, self.pupil[state], self.lid[state])
-                for term in TERMS[1:]
+                mapplan.term_value(self._scene(self.slip[state], term, finer=True), term, *gaze)
+                for term in terms
             ]
 
-        for slip in {tuple(self.slip[place[0]]) for place in chosen}:
-            self._scene(slip, finer=True)
-        values = np.array(self.run(finer, chosen)).reshape((len(chosen), len(TERMS) - 1) + self.pairs)
+        values = np.array(self.run(finer, chosen)).reshape((len(chosen), len(terms)) + self.pairs)
         bad = []
-        for k, term in enumerate(TERMS[1:]):
+        for k, term in enumerate(terms):
             error = np.array([np.abs(v - parts[term][at]) for v, at in zip(values[:, k], chosen)])
             error = error.reshape((-1,) + self.pairs)
             if error.size and error.max() > PEAK * self.tol * self.mean:
@@ -293,9 +330,9 @@ class Making:
             said.append("lids closed (opening 0): sclera, iris and glint are hidden exactly; error 0")
         if len(self.azimuth) > 1:
             said.append("face: computed once per elevation, because the lids follow elevation only; error 0")
-        for term in ("sclera", "iris", "mirror"):
-            if term in self._notes:
-                said.append(self._notes[term])
+        for name in ("no sclera", "no iris", "no glint", "sclera", "iris", "mirror"):
+            if name in self._notes:
+                said.append(self._notes[name])
         for term in TERMS:
             said.append(
                 "%s: integrated at fineness %.2g; against twice that, %.1e of the mean (rms)"
@@ -304,52 +341,13 @@ class Making:
         return said
 
 
-def counted_pairs(pairs):
-    """Mask [sensor, emitter] of the pairs of two different places, or of all when there are no other."""
-    if pairs[0] != pairs[1] or pairs[0] == 1:
-        return np.ones(pairs, bool)
-    return ~np.eye(pairs[0], dtype=bool)
-
-
-def mean_response(response, azimuth_deg, elevation_deg):
-    """The unit of errors: mean over gazes within +-20 degrees (all, when there are none) and over the pairs
-    that count. response [..., sensor, emitter, elevation, azimuth].
-    """
-    up, across = np.abs(elevation_deg) <= 20 + 1e-9, np.abs(azimuth_deg) <= 20 + 1e-9
-    if up.any() and across.any():
-        response = response[..., up, :][..., across]
-    return float(np.moveaxis(response, (-4, -3), (0, 1))[counted_pairs(response.shape[-4:-2])].mean())
-
-
-def scale_of(peak):
-    """What a pair's error is measured by: its peak, and a fiftieth of the average pair's so that pairs which
-    see next to nothing do not count as hard. peak [..., sensor, emitter].
-    """
-    return peak + 0.02 * peak.mean((-2, -1), keepdims=True) + 1e-300
-
-
-def bend(table):
-    """How sharply a table [state, elevation, azimuth, ...] bends from gaze to gaze; its value on an axis too
-    short for that.
-    """
-    out = np.zeros_like(table)
-    for axis in (1, 2):
-        if table.shape[axis] > 2:
-            inner = tuple(slice(1, -1) if k == axis else slice(None) for k in range(table.ndim))
-            out[inner] += np.abs(np.diff(table, 2, axis))
-    return out if out.any() else table
-
-
-def hardest(rough, azimuth, elevation, count, apart_deg=3.0):
-    """The `count` highest places (state, row, column) of [state, elevation, azimuth], some way apart."""
-    rough, places = rough.copy(), []
-    for _ in range(count):
-        at = tuple(int(i) for i in np.unravel_index(np.argmax(rough), rough.shape))
-        if not rough[at] > 0:
-            break
-        places.append(at)
-        near = (np.abs(elevation - elevation[at[1]]) < apart_deg)[:, None] & (
-            np.abs(azimuth - azimuth[at[2]]) < apart_deg
-        )
-        rough[at[0]][near] = 0
-    return places
+def _of_ports(pairs, sensors, emitters):
+    """Words for the ports that are not among the chosen."""
+    if not len(sensors) or not len(emitters):
+        return "all pairs"
+    words = []
+    for name, count, chosen in (("sensor", pairs[0], sensors), ("emitter", pairs[1], emitters)):
+        others = [str(i) for i in range(count) if i not in chosen]
+        if others:
+            words.append("%s%s %s" % (name, "s" * (len(others) > 1), ", ".join(others)))
+    return " and ".join(words)

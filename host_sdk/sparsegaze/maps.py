@@ -20,7 +20,8 @@ import numpy as np
 
 from . import __version__
 from .errors import SceneError
-from .mapmake import TERMS, Making, mean_response
+from .mapjudge import mean_response
+from .mapmake import Making
 from .mapstore import read_map, write_npz
 from .ring import ring_figures  # noqa: F401  (part of this module's interface)
 from .simulate import as_headset, as_person
