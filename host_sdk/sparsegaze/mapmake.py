@@ -21,8 +21,8 @@ from .scene import Scene
 TERMS = ("face", "sclera", "iris", "glint")
 SLOW = ("sclera", "iris")
 # Part of the tolerance that each term's integration, and each interpolation, may take. They add up as
-# independent errors do: sqrt(4 * 0.35^2 + 2 * 0.3^2) = 0.82.
-SHARE, SHARE_BETWEEN = 0.35, 0.3
+# independent errors do: sqrt(4 * 0.35^2 + 2 * 0.4^2) = 0.9.
+SHARE, SHARE_BETWEEN = 0.35, 0.4
 SAFETY = 3.0
 PEAK = 10.0  # an error at one gaze may be this many times the tolerance
 FIRST_NODES, MOST_NODES = 9, 129
@@ -106,14 +106,23 @@ class Making:
         gazes = mapplan.pilot_gazes(self.azimuth, self.elevation)
         states = [(self.pupil[i], self.lid[i]) for i in picked]
         self.pilot = mapplan.Pilot(self.headset, self.person, self._middle, gazes, states, self.run)
-        self.mean = float(
-            sum(self.pilot.value(term, 0) for term in TERMS)[:, counted_pairs(self.pairs)].mean()
-        )
+        rough = Scene(self.headset, self.person, self._middle, {"face": 0.35})
+        light = self.pilot.of(rough, "face") + sum(self.pilot.value(term, 0) for term in TERMS[1:])
+        self.mean = float(light[:, counted_pairs(self.pairs)].mean())
         self.rung, self.quality = {}, {}
-        for term in TERMS:
+        for term in TERMS[1:]:
             self._settle(term, self.pilot.choose(term, SHARE * self.tol * self.mean, self._rms))
         self._permit_mirror()
+        self._settle_face(2 if self.tol < 1e-3 else 0)
         self._leave_out()
+
+    def _settle_face(self, start):
+        tolerance = SHARE * self.tol * self.mean
+        rung, scene, error = self.pilot.choose_face(self.quality, tolerance, self._rms, start)
+        self.rung["face"], self.quality["face"] = rung, mapplan.fineness("face", rung)
+        self._scenes[tuple(self._middle), "", False] = scene
+        self._keep("face", error, self.pilot.value("face", rung).max(0))
+        self.rms["face"] = mapplan.RMS_SAFETY * self._rms(error) / max(self.mean, 1e-300)
 
     def _leave_out(self):
         """Find the ports that provably see nothing of a term."""
@@ -142,6 +151,7 @@ class Making:
             )
 
     def _settle(self, term, rung):
+        """Take a rung for a term of the eye."""
         self.rung[term], self.quality[term] = rung, mapplan.fineness(term, rung)
         error = self.pilot.error(term, rung)
         self._keep(term, error, np.abs(self.pilot.value(term, rung)).max(0))
@@ -154,7 +164,7 @@ class Making:
         pilot, rung, share = self.pilot, self.rung["glint"], SHARE * self.tol * self.mean
         if not 0 < share < 1:
             return
-        quality = {"glint": self.quality["glint"], "face": 0.1, "tolerance": share}
+        quality = {"glint": self.quality["glint"], "face": mapplan.EYE_ONLY, "tolerance": share}
         value = pilot.of(Scene(self.headset, self.person, self._middle, quality), "glint")
         error = np.abs(value - pilot.value("glint", rung + mapplan.FINER))
         rms = mapplan.RMS_SAFETY * self._rms(error)
@@ -189,7 +199,7 @@ class Making:
             if finer:
                 for name in TERMS[1:]:
                     quality[name] = mapplan.fineness(name, self.rung[name] + mapplan.FINER)
-                quality.pop("tolerance", None)
+                quality.update(face=mapplan.EYE_ONLY, tolerance=0.0)
             scene = self.headset, self.person, slip, quality
             self._scenes[key] = Chosen(*scene, *chosen) if chosen else Scene(*scene)
         return self._scenes[key]

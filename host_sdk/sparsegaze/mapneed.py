@@ -71,7 +71,7 @@ def _patch(radius_deg):
 
 
 def _reach(port, person, slip_mm, patch, apex):
-    """Bound of window weight over squared distance (1/mm^2) over a patch of the eye, at all depths between the
+    """Bound of window weight over squared distance (1/mm^2) over a patch of the eye, at depths from the
     iris's and the apex's.
     """
     at = np.add(port.position_mm, slip_mm) - person.eye_position_mm

@@ -5,6 +5,9 @@ A dozen gazes (quasi-random, plus corners and edges) are evaluated on a ladder o
 factor sqrt(2) apart. The error of a rung is its difference from the rung two above it, which is twice as
 fine; the cheapest rung whose rms error meets the term's share of the tolerance is taken. Values are shared
 between rungs, so that the whole climb costs little more than its last two rungs.
+
+The face costs at set-up and little afterwards, and its error falls by 4 and more from rung to rung; there a
+rung is compared with the one below it, and the scene of the chosen rung is the one that makes the map.
 """
 
 import numpy as np
@@ -14,7 +17,9 @@ from .scene import Scene
 STEP = 2.0**0.5  # fineness from rung to rung
 FINER = 2  # rungs between a value and what it is compared with
 START = {"sclera": 0.7, "iris": 0.35, "glint": 0.5, "face": 0.5}  # fineness of rung 0
-RUNGS = {"sclera": (-4, 5), "iris": (-2, 6), "glint": (-2, 7), "face": (-2, 3)}
+RUNGS = {"sclera": (-4, 5), "iris": (-2, 6), "glint": (-2, 7), "face": (-2, 6)}
+FACE_FALLS = 2.0  # error of a rung of the face <= its difference from the rung below / this; measured 3 to 7
+EYE_ONLY = 0.1  # fineness of the face where it is not asked for
 RMS_SAFETY = 1.5  # a dozen gazes see this much less than the map's rms, at worst
 N_PILOT = 12
 
@@ -53,18 +58,14 @@ class Pilot:
         """The scene whose eye terms are all on one rung. Its face is coarse."""
         if rung not in self._scenes:
             quality = {term: fineness(term, rung) for term in ("sclera", "iris", "glint")}
-            self._scenes[rung] = self._make(dict(quality, face=0.1))
+            self._scenes[rung] = self._make(dict(quality, face=EYE_ONLY))
         return self._scenes[rung]
 
     def value(self, term, rung):
         """[gaze, sensor, emitter] of a term on a rung."""
         key = term, rung
         if key not in self._values:
-            if term == "face":
-                scene = self._make({"face": fineness("face", rung), "sclera": 0.1, "iris": 0.1})
-            else:
-                scene = self.scene(rung)
-            self._values[key] = self.of(scene, term)
+            self._values[key] = self.of(self.scene(rung), term)
         return self._values[key]
 
     def of(self, scene, term):
@@ -81,7 +82,8 @@ class Pilot:
         return np.abs(self.value(term, rung) - self.value(term, rung + FINER))
 
     def choose(self, term, tolerance, rms):
-        """The lowest rung whose rms error, with its safety, is below an absolute tolerance; or the highest.
+        """The lowest rung of a term of the eye whose rms error, with its safety, is below an absolute
+        tolerance; or the highest.
 
         rms    of an error array, over the pairs that count
         """
@@ -98,6 +100,26 @@ class Pilot:
         while rung < high and not meets(rung):
             rung += 1
         return rung
+
+    def choose_face(self, quality, tolerance, rms, start):
+        """The same for the face, upward from two rungs: (rung, its scene, error [gaze, sensor, emitter]).
+
+        quality    of the other terms of the scene
+        """
+        low, high = RUNGS["face"]
+
+        def made(rung):
+            return self._make(dict(quality, face=fineness("face", rung)))
+
+        rung = int(np.clip(start, low + 1, high))
+        scenes = self._run(made, [rung - 1, rung])
+        below, here = (self.of(scene, "face") for scene in scenes)
+        while rung < high and RMS_SAFETY * rms(below - here) / FACE_FALLS > tolerance:
+            rung += 1
+            scenes = [None, made(rung)]
+            below, here = here, self.of(scenes[1], "face")
+        self._values["face", rung] = here
+        return rung, scenes[1], np.abs(below - here) / FACE_FALLS
 
 
 def fineness(term, rung):
