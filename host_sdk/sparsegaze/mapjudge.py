@@ -22,10 +22,10 @@ def mean_response(response, azimuth_deg, elevation_deg):
 
 
 def scale_of(peak):
-    """What a pair's error is measured by: its peak, and a fiftieth of the average pair's so that pairs which
+    """What a pair's error is measured by: its peak, and a third of the average pair's so that pairs which
     see next to nothing do not count as hard. peak [..., sensor, emitter].
     """
-    return peak + 0.02 * peak.mean((-2, -1), keepdims=True) + 1e-300
+    return peak + 0.3 * peak.mean((-2, -1), keepdims=True) + 1e-300
 
 
 def bend(table):

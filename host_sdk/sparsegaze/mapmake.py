@@ -25,8 +25,9 @@ SLOW = ("sclera", "iris")
 SHARE, SHARE_BETWEEN = 0.35, 0.4
 SAFETY = 3.0
 PEAK = 10.0  # an error at one gaze may be this many times the tolerance
-FIRST_NODES, MOST_NODES = 9, 129
+FIRST_NODES, MOST_NODES = 13, 193
 NEGLIGIBLE = 0.01  # part of the tolerance below which a term of a port is not computed at all
+HARDEST = 4  # gazes, of those where an interpolation is likeliest to be wrong, that are checked
 WORTH = 0.6  # interpolation is dropped when its points are more than this part of the map's gazes
 ROUNDS = 3
 PROGRESS = {"face": 0.02, "sclera": 0.3, "iris": 0.28, "glint": 0.4}  # part of a map's work, roughly
@@ -47,7 +48,7 @@ class Making:
         self.errors, self.rms, self._notes = {}, {}, {}
         self._workers, self._progress, self._base, self._shown = workers, progress, 0.0, 0.0
         self._between_share = dict.fromkeys(SLOW, SHARE_BETWEEN)
-        self._scenes, self._rough = {}, {}
+        self._scenes, self._rough = {}, set()
 
     def run(self, function, items, part=0.0):
         """List of function(item), in threads. part: of the progress that they are together."""
@@ -78,13 +79,16 @@ class Making:
                 if not wanted:
                     break
                 self._refine(wanted)
+        for term in SLOW:
+            self.rms[term] = float(np.hypot(self.rms[term], self.rms.pop(term + " between", 0.0)))
         total = sum(parts.values())
         self.mean = mean_response(np.moveaxis(total, (1, 2), (3, 4)), self.azimuth, self.elevation)
         return {term: np.moveaxis(values, (1, 2), (3, 4)) for term, values in parts.items()}
 
     def bound(self, parts):
         """Bound of the error at any gaze, [state, sensor, emitter]."""
-        seen = sum(SAFETY * self.errors[term] * scale_of(parts[term].max((3, 4))) for term in TERMS)
+        worst = {term: self.errors[term] + self.errors.get(term + " between", 0.0) for term in TERMS}
+        seen = sum(SAFETY * worst[term] * scale_of(parts[term].max((3, 4))) for term in TERMS)
         return seen + sum(self._unseen.values())
 
     def _rms(self, error):
@@ -111,14 +115,14 @@ class Making:
         self.mean = float(light[:, counted_pairs(self.pairs)].mean())
         self.rung, self.quality = {}, {}
         for term in TERMS[1:]:
-            self._settle(term, self.pilot.choose(term, SHARE * self.tol * self.mean, self._rms))
+            self._settle(term, self.pilot.choose(term, SHARE * self.tol * self.mean, self._rms, PEAK))
         self._permit_mirror()
         self._settle_face(2 if self.tol < 1e-3 else 0)
         self._leave_out()
 
     def _settle_face(self, start):
         tolerance = SHARE * self.tol * self.mean
-        rung, scene, error = self.pilot.choose_face(self.quality, tolerance, self._rms, start)
+        rung, scene, error = self.pilot.choose_face(self.quality, tolerance, self._rms, 1.2 * PEAK, start)
         self.rung["face"], self.quality["face"] = rung, mapplan.fineness("face", rung)
         self._scenes[tuple(self._middle), "", False] = scene
         self._keep("face", error, self.pilot.value("face", rung).max(0))
@@ -168,7 +172,7 @@ class Making:
         value = pilot.of(Scene(self.headset, self.person, self._middle, quality), "glint")
         error = np.abs(value - pilot.value("glint", rung + mapplan.FINER))
         rms = mapplan.RMS_SAFETY * self._rms(error)
-        if rms > share or np.array_equal(value, pilot.value("glint", rung)):
+        if rms > share or error.max() > PEAK * share or np.array_equal(value, pilot.value("glint", rung)):
             return
         self.quality["tolerance"] = share
         self._keep("glint", error, value.max(0))
@@ -181,9 +185,10 @@ class Making:
     def _refine(self, terms):
         """After an audit that found terms too coarse."""
         for term in terms:
+            self.errors.pop(term)
             if term in self._rough:
-                self._between_share[term] /= 4
-            elif term == "glint" and "tolerance" in self.quality:
+                self._between_share[term] /= 2
+            if term == "glint" and "tolerance" in self.quality:
                 del self.quality["tolerance"], self._notes["mirror"]
             else:
                 self._settle(term, min(self.rung[term] + 1, mapplan.RUNGS[term][1]))
@@ -208,7 +213,10 @@ class Making:
         """[state, elevation, azimuth, sensor, emitter] of a term, at every gaze of the map."""
         out = np.zeros((len(self.pupil), len(self.elevation), len(self.azimuth)) + self.pairs)
         slips = np.unique(self.slip, axis=0)
-        self._rough.pop(term, None)
+        self._rough.discard(term)
+        for kept in self.errors, self.rms:
+            kept.pop(term + " between", None)
+        self._notes.pop(term, None)
         for number, slip in enumerate(slips):
             members = np.flatnonzero((self.slip == slip).all(1))
             if term != "face":
@@ -244,7 +252,8 @@ class Making:
 
     def _between(self, scene, call, part):
         """The same by interpolation between Chebyshev points, halved along the rougher axis until gazes
-        between them agree; None when direct evaluation costs less.
+        between them agree: some anywhere, and those where half the points give something else. None when
+        direct evaluation costs less.
         """
         axes = self.elevation, self.azimuth
         count = [1 if len(axis) == 1 else FIRST_NODES for axis in axes]
@@ -268,7 +277,11 @@ class Making:
             error = np.abs(mapplan.interpolate_at(table, *nodes, gazes) - truth)
             rms = mapplan.RMS_SAFETY * self._rms(error)
             if rms <= tolerance:
-                return self._interpolated(call, table, nodes, error, rms)
+                made, hard = self._interpolated(scene, call, table, nodes)
+                if hard.max(initial=0.0) <= tolerance / SHARE_BETWEEN * PEAK / 2:
+                    errors = np.concatenate([error.reshape((-1,) + self.pairs), hard])
+                    self._keep_between(call, made, errors, nodes, rms)
+                    return made
             growable = [i for i in (0, 1) if 1 < count[i] < MOST_NODES]
             if not growable:
                 break
@@ -276,24 +289,28 @@ class Making:
             count[grow] = 2 * count[grow] - 1
         return None
 
-    def _interpolated(self, call, table, nodes, error, rms):
-        axes, term = (self.elevation, self.azimuth), call.term
-        made = np.moveaxis(mapplan.interpolate(table, *nodes, *axes), 2, 0)
+    def _interpolated(self, scene, call, table, nodes):
+        """(the term on the map's grid, its error [n, sensor, emitter] where half the points differ most)."""
+        axes = self.elevation, self.azimuth
         step = [1 if len(n) == 1 else 2 for n in nodes]
-        coarse = mapplan.interpolate(
-            table[:: step[0], :: step[1]], nodes[0][:: step[0]], nodes[1][:: step[1]], *axes
-        )
-        rough = self._rough.setdefault(term, np.zeros((len(self.pupil),) + made.shape[1:3]))
-        scale = scale_of(np.abs(made).max((0, 1, 2)))
-        rough[call.members] = (np.abs(made - np.moveaxis(coarse, 2, 0)) / scale).max((3, 4))
-        self._keep(term, error.reshape((-1,) + self.pairs), np.abs(made).max((0, 1, 2)))
-        before = self.rms[term]
-        self.rms[term] = float(np.hypot(before, rms / self.mean)) if term not in self._notes else before
+        half = table[:: step[0], :: step[1]], nodes[0][:: step[0]], nodes[1][:: step[1]]
+        made = np.moveaxis(mapplan.interpolate(table, *nodes, *axes), 2, 0)
+        coarse = np.moveaxis(mapplan.interpolate(*half, *axes), 2, 0)
+        rough = (np.abs(made - coarse) / scale_of(np.abs(made).max((0, 1, 2)))).max((0, 3, 4))
+        places = hardest(rough[None], self.azimuth, self.elevation, HARDEST)
+        truth = self.run(lambda at: call.value(scene, self.azimuth[at[2]], self.elevation[at[1]]), places)
+        error = [np.abs(made[:, at[1], at[2]] - value) for at, value in zip(places, truth)]
+        return made, np.array(error).reshape((-1,) + self.pairs)
+
+    def _keep_between(self, call, made, error, nodes, rms):
+        term = call.term
+        self._rough.add(term)
+        self._keep(term + " between", error, np.abs(made).max((0, 1, 2)))
+        self.rms[term + " between"] = max(self.rms.get(term + " between", 0.0), rms / self.mean)
         self._notes[term] = (
             "%s: computed at %d x %d gazes (azimuth x elevation) and interpolated; error at gazes between "
             "them %.1e of the mean (rms)" % (term, len(nodes[1]), len(nodes[0]), rms / self.mean)
         )
-        return made
 
     # the hardest gazes -------------------------------------------------------------------------------------
 
@@ -303,11 +320,8 @@ class Making:
         """
         chosen = set()
         for term in ("sclera", "iris", "glint"):
-            rough = self._rough.get(term)
-            if rough is None:
-                peak = scale_of(parts[term].max((0, 1, 2)))
-                rough = (bend(parts[term]) / peak).max((3, 4))
-            chosen.update(hardest(rough, self.azimuth, self.elevation, 3 + min(12, len(self.pupil) // 2)))
+            rough = (bend(parts[term]) / scale_of(parts[term].max((0, 1, 2)))).max((3, 4))
+            chosen.update(hardest(rough, self.azimuth, self.elevation, 2 + min(12, len(self.pupil) // 2)))
         chosen = sorted(chosen)
 
         terms = [t for t in TERMS[1:] if all(len(ports) for ports in self._chosen.get(t, [[0]]))]

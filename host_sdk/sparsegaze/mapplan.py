@@ -81,9 +81,9 @@ class Pilot:
         """Absolute error of a term on a rung, [gaze, sensor, emitter], against the rung twice as fine."""
         return np.abs(self.value(term, rung) - self.value(term, rung + FINER))
 
-    def choose(self, term, tolerance, rms):
+    def choose(self, term, tolerance, rms, peak):
         """The lowest rung of a term of the eye whose rms error, with its safety, is below an absolute
-        tolerance; or the highest.
+        tolerance, and its largest below `peak` of that; or the highest.
 
         rms    of an error array, over the pairs that count
         """
@@ -91,7 +91,8 @@ class Pilot:
         rung = 0
 
         def meets(at):
-            return RMS_SAFETY * rms(self.error(term, at)) <= tolerance
+            error = self.error(term, at)
+            return RMS_SAFETY * rms(error) <= tolerance and error.max() <= peak * tolerance
 
         if meets(rung):
             while rung > low and meets(rung - 1):
@@ -101,7 +102,7 @@ class Pilot:
             rung += 1
         return rung
 
-    def choose_face(self, quality, tolerance, rms, start):
+    def choose_face(self, quality, tolerance, rms, peak, start):
         """The same for the face, upward from two rungs: (rung, its scene, error [gaze, sensor, emitter]).
 
         quality    of the other terms of the scene
@@ -114,7 +115,12 @@ class Pilot:
         rung = int(np.clip(start, low + 1, high))
         scenes = self._run(made, [rung - 1, rung])
         below, here = (self.of(scene, "face") for scene in scenes)
-        while rung < high and RMS_SAFETY * rms(below - here) / FACE_FALLS > tolerance:
+
+        def meets():
+            error = np.abs(below - here) / FACE_FALLS
+            return RMS_SAFETY * rms(error) <= tolerance and error.max() <= peak * tolerance
+
+        while rung < high and not meets():
             rung += 1
             scenes = [None, made(rung)]
             below, here = here, self.of(scenes[1], "face")
