@@ -318,9 +318,10 @@ class Making:
         """Compare the map with everything twice as fine where it is likeliest to be wrong; returns the terms
         whose error at a gaze is more than PEAK tolerances.
         """
-        chosen = set()
-        for term in ("sclera", "iris", "glint"):
+        chosen, roughness = set(), {}
+        for term in TERMS[1:]:
             rough = (bend(parts[term]) / scale_of(parts[term].max((0, 1, 2)))).max((3, 4))
+            roughness[term] = rough
             chosen.update(hardest(rough, self.azimuth, self.elevation, 2 + min(12, len(self.pupil) // 2)))
         chosen = sorted(chosen)
 
@@ -345,6 +346,12 @@ class Making:
             if error.size and error.max() > PEAK * self.tol * self.mean:
                 bad.append(term)
             self._keep(term, error, parts[term].max((0, 1, 2)))
+            # The rms over the map, if errors are as the map bends.
+            rough = roughness[term]
+            here = np.sqrt(np.mean([rough[at] ** 2 for at in chosen])) if chosen else 0.0
+            if here > 0:
+                rms = mapplan.RMS_SAFETY * self._rms(error) * np.sqrt((rough**2).mean()) / here
+                self.rms[term] = max(self.rms[term], float(rms / max(self.mean, 1e-300)))
         return bad
 
     def left_out(self):
