@@ -23,13 +23,14 @@ SLOW = ("sclera", "iris")
 # Part of the tolerance that each term's integration, and each interpolation, may take. They add up as
 # independent errors do: sqrt(4 * 0.35^2 + 2 * 0.4^2) = 0.9.
 SHARE, SHARE_BETWEEN = 0.35, 0.4
-SAFETY = 3.0
+SAFETY = 4.0
 PEAK = 10.0  # an error at one gaze may be this many times the tolerance
 FIRST_NODES, MOST_NODES = 13, 193
 NEGLIGIBLE = 0.01  # part of the tolerance below which a term of a port is not computed at all
 HARDEST = 4  # gazes, of those where an interpolation is likeliest to be wrong, that are checked
 WORTH = 0.6  # interpolation is dropped when its points are more than this part of the map's gazes
-ROUNDS = 3
+ROUNDS = 2
+LATTICE = 6  # gazes along each axis at which the map is compared with half its fineness
 PROGRESS = {"face": 0.02, "sclera": 0.3, "iris": 0.28, "glint": 0.4}  # part of a map's work, roughly
 
 
@@ -124,7 +125,7 @@ class Making:
         tolerance = SHARE * self.tol * self.mean
         rung, scene, error = self.pilot.choose_face(self.quality, tolerance, self._rms, 1.2 * PEAK, start)
         self.rung["face"], self.quality["face"] = rung, mapplan.fineness("face", rung)
-        self._scenes[tuple(self._middle), "", False] = scene
+        self._scenes[tuple(self._middle), "", 0] = scene
         self._keep("face", error, self.pilot.value("face", rung).max(0))
         self.rms["face"] = mapplan.RMS_SAFETY * self._rms(error) / max(self.mean, 1e-300)
 
@@ -196,14 +197,15 @@ class Making:
 
     # terms -------------------------------------------------------------------------------------------------
 
-    def _scene(self, slip, term, finer=False):
+    def _scene(self, slip, term, rungs=0):
+        """The scene for a term at a slip; `rungs` finer (coarser) than what makes the map, for checks."""
         chosen = self._chosen.get(term)
-        key = tuple(slip), term if chosen else "", finer
+        key = tuple(slip), term if chosen else "", rungs
         if key not in self._scenes:
             quality = dict(self.quality)
-            if finer:
+            if rungs:
                 for name in TERMS[1:]:
-                    quality[name] = mapplan.fineness(name, self.rung[name] + mapplan.FINER)
+                    quality[name] = mapplan.fineness(name, self.rung[name] + rungs)
                 quality.update(face=mapplan.EYE_ONLY, tolerance=0.0)
             scene = self.headset, self.person, slip, quality
             self._scenes[key] = Chosen(*scene, *chosen) if chosen else Scene(*scene)
@@ -315,30 +317,22 @@ class Making:
     # the hardest gazes -------------------------------------------------------------------------------------
 
     def _audit(self, parts):
-        """Compare the map with everything twice as fine where it is likeliest to be wrong; returns the terms
-        whose error at a gaze is more than PEAK tolerances.
+        """Compare the map with everything twice as fine where it is likeliest to be wrong: where it bends
+        most, and where half the fineness gives something else, on a lattice. Returns the terms whose error at
+        a gaze is more than PEAK tolerances.
         """
-        chosen, roughness = set(), {}
-        for term in TERMS[1:]:
-            rough = (bend(parts[term]) / scale_of(parts[term].max((0, 1, 2)))).max((3, 4))
-            roughness[term] = rough
-            chosen.update(hardest(rough, self.azimuth, self.elevation, 2 + min(12, len(self.pupil) // 2)))
-        chosen = sorted(chosen)
-
         terms = [t for t in TERMS[1:] if all(len(ports) for ports in self._chosen.get(t, [[0]]))]
-        for slip in {tuple(self.slip[place[0]]) for place in chosen}:
-            for term in terms:
-                self._scene(slip, term, finer=True)
-
-        def finer(place):
-            state, row, column = place
-            gaze = self.azimuth[column], self.elevation[row], self.pupil[state], self.lid[state]
-            return [
-                mapplan.term_value(self._scene(self.slip[state], term, finer=True), term, *gaze)
-                for term in terms
-            ]
-
-        values = np.array(self.run(finer, chosen)).reshape((len(chosen), len(terms)) + self.pairs)
+        chosen, roughness = set(), {}
+        lattice = self._lattice()
+        coarse = self._at(lattice, terms, -mapplan.FINER)
+        for k, term in enumerate(terms):
+            scale = scale_of(parts[term].max((0, 1, 2)))
+            roughness[term] = rough = (bend(parts[term]) / scale).max((3, 4))
+            chosen.update(hardest(rough, self.azimuth, self.elevation, 2 + min(12, len(self.pupil) // 2)))
+            off = [(np.abs(v - parts[term][at]) / scale).max() for v, at in zip(coarse[:, k], lattice)]
+            chosen.update(lattice[i] for i in np.argsort(off)[-3:])
+        chosen = sorted(chosen)
+        values = self._at(chosen, terms, mapplan.FINER)
         bad = []
         for k, term in enumerate(terms):
             error = np.array([np.abs(v - parts[term][at]) for v, at in zip(values[:, k], chosen)])
@@ -353,6 +347,31 @@ class Making:
                 rms = mapplan.RMS_SAFETY * self._rms(error) * np.sqrt((rough**2).mean()) / here
                 self.rms[term] = max(self.rms[term], float(rms / max(self.mean, 1e-300)))
         return bad
+
+    def _lattice(self):
+        """Places (state, row, column) spread over the map, the states in turn."""
+        rows, columns = (
+            np.unique(np.linspace(0, len(axis) - 1, LATTICE).round().astype(int))
+            for axis in (self.elevation, self.azimuth)
+        )
+        gazes = [(int(row), int(column)) for row in rows for column in columns]
+        lit = np.flatnonzero(self.lid > 0)
+        return [(int(lit[(5 * k) % len(lit)]),) + gaze for k, gaze in enumerate(gazes)] if len(lit) else []
+
+    def _at(self, places, terms, rungs):
+        """Terms at places of the map with another fineness, [place, term, sensor, emitter]."""
+        for slip in {tuple(self.slip[place[0]]) for place in places}:
+            for term in terms:
+                self._scene(slip, term, rungs)
+
+        def one(place):
+            state, row, column = place
+            gaze = self.azimuth[column], self.elevation[row], self.pupil[state], self.lid[state]
+            return [
+                mapplan.term_value(self._scene(self.slip[state], term, rungs), term, *gaze) for term in terms
+            ]
+
+        return np.array(self.run(one, places)).reshape((len(places), len(terms)) + self.pairs)
 
     def left_out(self):
         """Sentences on what was left out or simplified, why, and what that costs."""
