@@ -385,7 +385,7 @@ class Making:
                 said.append(self._notes[name])
         for term in TERMS:
             said.append(
-                "%s: integrated at fineness %.2g; against twice that, %.1e of the mean (rms)"
+                "%s: integrated at fineness %.2g; error %.1e of the mean (rms)"
                 % (term, self.quality[term], self.rms[term])
             )
         return said
