@@ -8,7 +8,8 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { N_AXES = 7, HEADER_BYTES = 72, HEAD_BYTES = 40, MAX_PAIRS = SIM_MAP_MAX_SENSORS * SIM_MAP_MAX_EMITTERS };
+enum { N_AXES = 7, HEADER_BYTES = 72, HEAD_BYTES = 40 };
+enum { MAX_PAIRS = SIM_MAP_MAX_SENSORS * SIM_MAP_MAX_EMITTERS };
 enum { MAX_ROWS = 4 * 4 * 4 * 4 * 4 * 4 };  // four taps along all axes but azimuth
 enum { AX_SLIP, AX_PUPIL = 3, AX_LID, AX_EL, AX_AZ };
 #ifdef __GNUC__
@@ -95,8 +96,8 @@ static int values_here(unsigned char *p, size_t n, int bytes) {
     float *out = (float *)(void *)p;
     int ok = 1;
     for (size_t i = 0; i < n; ++i) {
-        uint32_t bits =
-            p[4 * i] | (uint32_t)p[4 * i + 1] << 8 | (uint32_t)p[4 * i + 2] << 16 | (uint32_t)p[4 * i + 3] << 24;
+        const unsigned char *b = p + 4 * i;
+        uint32_t bits = b[0] | (uint32_t)b[1] << 8 | (uint32_t)b[2] << 16 | (uint32_t)b[3] << 24;
         memcpy(&out[i], &bits, sizeof bits);
         ok &= fabsf(out[i]) < 1e30f;
     }
@@ -304,16 +305,16 @@ static void add(double *restrict out, double weight, const float *restrict row, 
     for (size_t p = 0; p < pairs; ++p) out[p] += weight * (double)row[p];
 }
 
-// Rows of up to four neighbours in azimuth about a place: where each begins, its taps along the other axes and
-// the product of their weights.
+// Rows of up to four neighbours in azimuth about a place: where each begins, its taps along the other axes
+// and the product of their weights.
 struct rows {
     int n, tap[MAX_ROWS][AX_AZ];
     size_t at[MAX_ROWS];
     double weight[MAX_ROWS];
 };
 
-// The tables are larger than any cache and a state's rows lie far apart: all are asked for before the first is
-// used, which halves the time of a state that was not looked at lately.
+// The tables are larger than any cache and a state's rows lie far apart: all are asked for before the first
+// is used, which halves the time of a state that was not looked at lately.
 static void find_rows(const struct table *t, const struct spline_place place[N_AXES], size_t pairs, int all,
                       struct rows *rows) {
     rows->n = 1;

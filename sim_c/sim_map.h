@@ -41,7 +41,7 @@ enum {
     SIM_MAP_MAX_SENSORS = 32,
     SIM_MAP_MAX_EMITTERS = 32,
     SIM_MAP_MAX_TABLES = 8,
-    SIM_MAP_MAX_STATE_NODES = 64,
+    SIM_MAP_MAX_STATE_NODES = 128,
     SIM_MAP_MAX_GAZE_NODES = 513
 };
 
@@ -76,7 +76,7 @@ int sim_map_sensors(const struct sim_map *map);
 int sim_map_emitters(const struct sim_map *map);
 
 // Response of every pair at one state: out[sensor * emitters + emitter], never negative.
-// Returns 0, or -1 when a state field is not finite (out is then all zero). Reentrant. 1 (lids open) to 4
+// Returns 0, or -1 when a state field is not finite (out is then all zero). Reentrant. 1.5 (lids open) to 6
 // microseconds for 36 pairs when vectorised.
 int sim_map_eval(const struct sim_map *map, const struct sim_state *state, double *out);
 
@@ -90,8 +90,8 @@ int sim_map_eval_parts(const struct sim_map *map, const struct sim_state *state,
 
 // The response (not clamped at zero) and its derivatives, of the same splines: gradient[7][sensors][emitters]
 // by azimuth and elevation (per degree), pupil (per mm), lid opening, slip x, y, z (per mm), as in struct
-// sim_state. Where the state is clamped, and along axes of one node, they are 0; on the edge of the map, those
-// from within. out may be NULL. Returns as sim_map_eval(). About three times its cost.
+// sim_state. Where the state is clamped, and along axes of one node, they are 0; on the edge of the map,
+// those from within. out may be NULL. Returns as sim_map_eval(). Two to five times its cost.
 int sim_map_eval_gradient(const struct sim_map *map, const struct sim_state *state, double *out,
                           double *gradient);
 

@@ -37,7 +37,9 @@ class Seeds(click.ParamType):
     "--persons", type=Seeds(), default="0-19", show_default=True, metavar="SEEDS", help="Whom to simulate."
 )
 @click.option("--workers", type=click.IntRange(1, 1024), help="Processes.  [default: one per core]")
-@click.option("--grid", type=click.IntRange(1, 181), default=21, show_default=True, help="Gazes along each axis.")
+@click.option(
+    "--grid", type=click.IntRange(1, 181), default=21, show_default=True, help="Gazes along each axis."
+)
 @click.option("--half-angle", type=float, default=25.0, show_default=True, help="Gaze reaches, deg, 0..45.")
 @click.option(
     "--tol", type=float, default=1e-4, show_default=True, help="Error allowed, rms, of the mean response."
@@ -91,6 +93,7 @@ def study(headsets, output, persons, workers, grid, half_angle, tol, pupil, lids
     for failure in made.failures:
         console.warn(f"{failure.headset} on {failure.person}: {failure.reason}")
     items = len(made.headsets) * len(made.persons)
+    there = items - made.computed - len(made.failures)
     data = {
         "file": output,
         "headsets": made.headsets.tolist(),
@@ -105,7 +108,7 @@ def study(headsets, output, persons, workers, grid, half_angle, tol, pupil, lids
         *pairs(
             [
                 ("study", f"{len(made.headsets)} headset(s) on {len(made.persons)} person(s)"),
-                ("items", f"{made.computed} computed, {items - made.computed - len(made.failures)} were there"),
+                ("items", f"{made.computed} computed, {there} were there"),
                 ("failed", len(made.failures)),
                 ("response", " x ".join(map(str, made.response.shape))),
                 ("written", output),

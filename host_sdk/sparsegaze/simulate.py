@@ -18,15 +18,22 @@ from .headset import Headset, load_headset
 from .mapfile import AXES, PUPIL_ANY_MM, write_tables
 from .person import Person, draw_person, load_person
 from .scene import simulator
-from .tabulate import RANDOM_STATES, TABLES_VERSION, choose_glint_nodes, lid_nodes, measure_error, tabulate
+from .tabulate import (
+    RANDOM_STATES,
+    TABLES_VERSION,
+    choose_glint_nodes,
+    lid_nodes,
+    measure_error,
+    tabulate,
+)
 
 # Gaze goes beyond the +-20 degrees of the targets: saccades overshoot and blinks drag the eye.
 HALF_ANGLE_DEG = 25.0
-SMOOTH_GAZE_NODES = 31
+SMOOTH_GAZE_NODES = 27
 PUPIL_NODES_MM = tuple(2.0 + 0.5 * k for k in range(13))
 # Nodes of the lids' opening by term: a margin of 0.8 mm cuts the glint, a point, and the skin beside it
 # sharply, the sclera and the iris as areas. About 1 mm of the margin's way is 0.1 of opening.
-LID_NODES = {"face": 41, "sclera": 21, "iris": 21, "glint": 21}
+LID_NODES = {"face": 81, "sclera": 41, "iris": 41, "glint": 61}
 PUPIL_NOMINAL_MM = 3.5
 # Fineness of the nodes' own values, where not the default's: an error there looks like structure.
 TABLE_QUALITY = {"sclera": 1.0, "iris": 1.0, "glint": 1.0, "face": 1.0}
@@ -250,7 +257,7 @@ class ResponseMap:
         self.close()
 
     def axis(self, table, name):
-        """Nodes of an axis (one of mapfile.AXES) of a table, numbered as in the file; [] where there is none."""
+        """Nodes of an axis (of mapfile.AXES) of a table, numbered as in the file; [] where there is none."""
         nodes = self._ffi.new("double **")
         count = self._lib.sim_map_axis(self._map, table, AXES.index(name), nodes)
         return np.array([nodes[0][i] for i in range(count)])
@@ -282,7 +289,7 @@ class ResponseMap:
         return out
 
     def parts(self, states):
-        """(smooth terms, glint), each [n, sensor, emitter]: their sum is the response, before it is cut at 0."""
+        """(smooth terms, glint), each [n, sensor, emitter]: their sum is the response, not cut at 0."""
         full = self._states(states)
         terms = np.empty((2, len(full)) + self.shape)
         state = self._ffi.cast("struct sim_state *", self._ffi.from_buffer("double[]", full))

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from .errors import SceneError
-from .mapfile import GLINT, PUPIL_ANY_MM, SMOOTH, fit_table
+from .mapfile import AXES, GLINT, PUPIL_ANY_MM, SMOOTH, fit_table
 from .scene import Scene
 
 TABLES_VERSION = 2  # changes with what this module or the file's layout does to values
@@ -22,8 +22,8 @@ MOST_VALUES = 1 << 27  # of all tables: half of what the reader takes
 LIDS_A_CALL = 32  # SIM_MAX_LIDS
 
 # The glint's step follows the narrowest lobe, that of the smallest lenses: at 33 degrees per unit of Beckmann
-# width a cubic spline is right to 6e-6 rms of the mean response; but the limbus and the margins have widths too.
-_STEP_PER_LOBE_DEG, _WIDEST_STEP_DEG = 33.0, 0.6
+# width a cubic spline is right to 1e-5 rms of the mean response; but limbus and margins have widths too.
+_STEP_PER_LOBE_DEG, _WIDEST_STEP_DEG = 33.0, 0.8
 _LARGEST_STEP_ERROR = 3e-4  # of the mean response, in the worst cells of a few lines: else the step shrinks
 _TABLE_VALUES = 16e6  # most values of one term's table, 2 bytes each: lids' nodes go first
 FEWEST_LIDS = 11
@@ -114,8 +114,9 @@ def _row(scene, term, nodes, elevation):
 
 
 def tabulate(headset, person, grid, progress=None, workers=1):
-    """(tables, node values by term): grid is a simulate.Grid. SceneError when the scene is impossible or the
-    tables are larger than a map may be.
+    """(tables, values by term, nodes by term) of a map; grid is a simulate.Grid.
+
+    SceneError when the scene is impossible or the tables are larger than a map may be.
     """
     n_slip = tuple(len(axis) for axis in grid.slip_mm)
     slips = list(np.ndindex(*n_slip))
@@ -126,7 +127,7 @@ def tabulate(headset, person, grid, progress=None, workers=1):
     nodes = grid.nodes(scenes[0], headset, person)
     pairs = (len(headset.sensors), len(headset.emitters))
     shape = {
-        term: tuple(len(nodes[term][axis]) for axis in ("pupil_mm", "lid_opening", "elevation_deg", "azimuth_deg"))
+        term: tuple(len(nodes[term][axis]) for axis in AXES[3:])
         for term in TERMS
     }
     if sum(np.prod(shape[term]) for term in TERMS) * len(slips) * np.prod(pairs) > MOST_VALUES:
@@ -134,12 +135,7 @@ def tabulate(headset, person, grid, progress=None, workers=1):
     values = {term: np.empty(n_slip + shape[term] + pairs, np.float32) for term in TERMS}
     # Costs of a node of a term, in any unit, for the progress.
     cost = {"face": 0.5, "sclera": 1.0, "iris": 1.0, "glint": 0.3}
-    jobs = [
-        (at, term, row)
-        for at in range(len(slips))
-        for term in TERMS
-        for row in range(shape[term][2])
-    ]
+    jobs = [(at, term, row) for at in range(len(slips)) for term in TERMS for row in range(shape[term][2])]
     total = sum(cost[term] * np.prod(shape[term][1:]) for term in TERMS) * len(slips)
     lock, done = threading.Lock(), [0.0]
 
@@ -157,11 +153,10 @@ def tabulate(headset, person, grid, progress=None, workers=1):
             job.result()
     tables = []
     for term in TERMS:
-        axes = (*grid.slip_mm, *(nodes[term][a] for a in ("pupil_mm", "lid_opening", "elevation_deg", "azimuth_deg")))
+        axes = (*grid.slip_mm, *(nodes[term][axis] for axis in AXES[3:]))
         small = values[term].nbytes < 1 << 24
-        tables.append(
-            fit_table(GLINT if term == "glint" else SMOOTH, axes, values[term], 4 if small else 2)
-        )
+        kind = GLINT if term == "glint" else SMOOTH
+        tables.append(fit_table(kind, axes, values[term], 4 if small else 2))
     return tables, values, nodes
 
 
@@ -183,9 +178,7 @@ def hard_states(values, nodes, pupils, count, lids):
             cell = list(np.unravel_index(np.argmax(bend), bend.shape))
             bend[tuple(slice(max(0, c - 4), c + 5) for c in cell)] = -1.0
             cell[axis - 1] += 1
-            lid, elevation, azimuth = (
-                nodes_of[c : c + 2].mean() for nodes_of, c in zip(axes, cell)
-            )
+            lid, elevation, azimuth = (at_axis[c : c + 2].mean() for at_axis, c in zip(axes, cell))
             found.append((azimuth, elevation, pupils[len(found) % len(pupils)], lid))
     return np.array(found).reshape(-1, 4)
 
@@ -195,15 +188,16 @@ def measure_error(evaluate, headset, person, grid, values, nodes):
     evaluation, times the margins above.
     """
     rng = np.random.default_rng(20)
-    pupil, lid, half = nodes["iris"]["pupil_mm"], nodes["glint"]["lid_opening"], nodes["glint"]["azimuth_deg"][-1]
-    slips = [np.zeros(3)] if all(len(a) == 1 for a in grid.slip_mm) else [
-        np.array([rng.uniform(a[0], a[-1]) for a in grid.slip_mm]) for _ in range(3)
+    pupil, lid = nodes["iris"]["pupil_mm"], nodes["glint"]["lid_opening"]
+    half = nodes["glint"]["azimuth_deg"][-1]
+    still = all(len(axis) == 1 for axis in grid.slip_mm)
+    slips = [
+        np.array([rng.uniform(axis[0], axis[-1]) for axis in grid.slip_mm]) for _ in range(1 if still else 3)
     ]
-    if len(slips) == 1:
-        slips = [np.array([a[0] for a in grid.slip_mm])]
     finer = {key: min(16.0, CHECK_FINENESS * value) for key, value in grid.table_quality().items()}
     scenes = [Scene(headset, person, slip, finer) for slip in slips]
-    others = ~np.eye(*scenes[0].shape, dtype=bool) if min(scenes[0].shape) > 1 else np.ones(scenes[0].shape, bool)
+    shape = scenes[0].shape
+    others = ~np.eye(*shape, dtype=bool) if min(shape) > 1 else np.ones(shape, bool)
     middles = (pupil[1:] + pupil[:-1]) / 2 if len(pupil) > 1 else pupil
     result = []
     for lids in (False, True):

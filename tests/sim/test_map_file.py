@@ -94,7 +94,9 @@ def test_absurd_node_counts_are_refused_before_use(good, tmp_path, table, axis, 
     refusal(tmp_path, patched(good, head_of(table) + 8 + 4 * axis, "I", value))
 
 
-@pytest.mark.parametrize("nodes", [(64,) * 5 + (513, 513), (64, 64, 64, 1, 1, 1, 1), (1, 1, 1, 64, 64, 513, 1)])
+@pytest.mark.parametrize(
+    "nodes", [(128,) * 5 + (513, 513), (128, 128, 128, 1, 1, 1, 1), (1, 1, 1, 64, 64, 513, 1)]
+)
 def test_counts_whose_product_would_overflow_are_refused(good, tmp_path, nodes):
     data = patched(patched(good, 20, "2I", 32, 32), head_of(0) + 8, "7I", *nodes)
     assert "large" in refusal(tmp_path, data)

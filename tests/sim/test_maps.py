@@ -53,8 +53,10 @@ def random_states(seed, count, half_deg, lids=(1.0, 1.0)):
 
 def sharp(headset):
     """The headset with lenses that are points: their glints are as narrow as the tear film leaves them."""
-    ports = [tuple(replace(p, lens_radius_mm=0.0) for p in ports) for ports in (headset.sensors, headset.emitters)]
-    return replace(headset, sensors=ports[0], emitters=ports[1])
+    sensors, emitters = (
+        tuple(replace(p, lens_radius_mm=0.0) for p in ports) for ports in (headset.sensors, headset.emitters)
+    )
+    return replace(headset, sensors=sensors, emitters=emitters)
 
 
 @pytest.mark.parametrize("half_deg", [20.0, 25.0])
@@ -113,8 +115,9 @@ def test_the_stated_error_follows_the_nodes(led2gaze, tmp_path, rough):
 
 
 def test_derivatives_are_those_of_the_response_itself(led2gaze, tmp_path):
-    grid = Grid(half_angle_deg=6.0, smooth_nodes=8, lid_opening=(1.0,), slip_mm=((-0.5, 0.0, 0.5), (0.0,), (0.0,)),
-                pupil_mm=(3.0, 3.5, 4.0), check_states=1)  # fmt: skip
+    slips = ((-0.5, 0.0, 0.5), (0.0,), (0.0,))
+    grid = dict(half_angle_deg=6.0, smooth_nodes=8, pupil_mm=(3.0, 3.5, 4.0), lid_opening=(1.0,))
+    grid = Grid(**grid, slip_mm=slips, check_states=1)
     person = draw_person(3)
     with ResponseMap(response_map(led2gaze, person, cache=str(tmp_path), grid=grid)) as opened:
         state = np.array([2.3, -1.7, 3.4, 1.0, 0.1, 0.0, 0.0])
@@ -132,8 +135,8 @@ def test_derivatives_are_those_of_the_response_itself(led2gaze, tmp_path):
 
 
 def test_the_mean_is_the_integral_that_the_header_says(led2gaze, tmp_path):
-    grid = Grid(half_angle_deg=20.0, smooth_nodes=9, glint_nodes=9, pupil_mm=(3.0, 3.5, 4.0), lid_opening=(1.0,),
-                check_states=1)  # fmt: skip
+    grid = dict(half_angle_deg=20.0, smooth_nodes=9, glint_nodes=9, pupil_mm=(3.0, 3.5, 4.0))
+    grid = Grid(**grid, lid_opening=(1.0,), check_states=1)
     path = response_map(led2gaze, Person(), cache=str(tmp_path), grid=grid)
     with ResponseMap(path) as opened:
         gaze = np.arange(-19.75, 20, 0.5)  # midpoints

@@ -56,7 +56,8 @@ def test_the_array_is_headset_person_state_sensor_emitter_elevation_azimuth(head
     from sparsegaze.maps import compute_map
 
     assert expected.response.shape == (2, 2, 1, 1, 1, 2, 2) and np.isfinite(expected.response).all()
-    assert expected.headsets.tolist() == ["low", "side"] and expected.persons.tolist() == ["person 3", "person 8"]
+    assert expected.headsets.tolist() == ["low", "side"]
+    assert expected.persons.tolist() == ["person 3", "person 8"]
     assert expected.azimuth_deg.tolist() == [-8, 8] and expected.computed == 4 and not expected.failures
     made = compute_map(headsets["side"], 3, **QUICK)
     np.testing.assert_array_equal(expected.response[1, 0], made.response)
@@ -155,7 +156,8 @@ from test_study import QUICK, pair, port
 from sparsegaze.study import sweep
 if __name__ == "__main__":
     low = pair(port((-10, -12, -28)), port((10, -12, -28)))
-    sweep([low], range(40), directory={folder!r}, workers=1, progress=lambda *a: print(a[0], flush=True), **QUICK)
+    tell = lambda done, total, name: print(done, flush=True)
+    sweep([low], range(40), directory={folder!r}, workers=1, progress=tell, **QUICK)
 """
 
 
@@ -163,7 +165,9 @@ def test_after_a_kill_only_what_was_not_finished_is_computed(headsets, tmp_path)
     folder = tmp_path / "items"
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(tests=os.path.dirname(__file__), folder=str(folder)))
-    run_it = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True, start_new_session=True)
+    run_it = subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
     try:
         for line in run_it.stdout:
             if int(line) >= 3:
@@ -181,8 +185,9 @@ def test_after_a_kill_only_what_was_not_finished_is_computed(headsets, tmp_path)
 
 
 def test_ctrl_c_ends_the_command_and_the_same_command_goes_on(headset_path, tmp_path):
-    command = [sys.executable, "-m", "sparsegaze.cli", "study", headset_path, "--persons", "0-2", "--grid", "1"]
-    command += ["--tol", "0.1", "--workers", "1", "-o", str(tmp_path / "s.npz"), "--directory", str(tmp_path / "d")]
+    command = [sys.executable, "-m", "sparsegaze.cli", "study", headset_path, "--persons", "0-2"]
+    command += ["--grid", "1", "--tol", "0.1", "--workers", "1"]
+    command += ["-o", str(tmp_path / "s.npz"), "--directory", str(tmp_path / "d")]
     first = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     try:
         end = time.monotonic() + 120
