@@ -60,7 +60,7 @@ def choose_glint_nodes(scene, headset, person, half_angle_deg):
     most = int(min(513, (_TABLE_VALUES / (FEWEST_LIDS * np.prod(scene.shape))) ** 0.5))
     step = glint_step_deg(headset, person)
     for _ in range(4):
-        nodes = min(most, int(np.ceil(2 * half_angle_deg / step)) + 1)
+        nodes = max(5, min(most, int(np.ceil(2 * half_angle_deg / step)) + 1))
         if nodes == most or _line_error(scene, half_angle_deg, nodes) <= _LARGEST_STEP_ERROR * mean:
             break
         step /= 1.4
@@ -200,7 +200,7 @@ def measure_error(evaluate, headset, person, grid, values, nodes):
     others = ~np.eye(*shape, dtype=bool) if min(shape) > 1 else np.ones(shape, bool)
     middles = (pupil[1:] + pupil[:-1]) / 2 if len(pupil) > 1 else pupil
     result = []
-    for lids in (False, True):
+    for lids in (False, True)[: min(2, len(lid))]:
         n = grid.check_states
         states = np.column_stack(
             [
@@ -218,4 +218,4 @@ def measure_error(evaluate, headset, person, grid, values, nodes):
             error.append((evaluate(np.concatenate([state, slips[which]])[None])[0] - direct)[others])
         error = np.array(error)
         result += [RMS_MARGIN * np.sqrt(np.mean(error[:n] ** 2)), MAX_MARGIN * np.abs(error).max()]
-    return tuple(result)
+    return tuple(result) if len(lid) > 1 else tuple(2 * result)

@@ -13,7 +13,7 @@ from sparsegaze.scene import Scene
 from sparsegaze.simulate import STATE_FIELDS, Grid, ResponseMap, evaluate, map_name, response_map
 from sparsegaze.tabulate import glint_step_deg
 
-LIDS_RMS, LIDS_MAX = 2e-3, 3e-2  # of the mean response
+LIDS_RMS, LIDS_MAX = 3e-4, 4e-3  # of the mean response
 
 # All the product's nodes but those of the lids.
 OPEN = dict(lid_opening=(1.0,), check_states=8)
