@@ -16,7 +16,7 @@ from sparsegaze.tabulate import glint_step_deg
 LIDS_RMS, LIDS_MAX = 3e-4, 4e-3  # of the mean response
 
 # All the product's nodes but those of the lids.
-OPEN = dict(lid_opening=(1.0,), check_states=8)
+OPEN = dict(lid_opening=(1.0,))
 TINY = dict(
     half_angle_deg=5.0,
     smooth_nodes=4,
@@ -26,7 +26,7 @@ TINY = dict(
     quality={"face": 0.2, "sclera": 0.2, "iris": 0.25}.items(),
     check_states=2,
 )
-FINER = dict(sclera=3.0, iris=2.0, glint=2.0, face=2.0)
+FINER = dict(sclera=3.0, iris=3.0, glint=2.0, face=2.0)
 
 
 def off_grid(opened, headset, person, states):
@@ -194,10 +194,11 @@ def test_threads_do_not_change_a_bit(led2gaze, tmp_path):
 
 
 def test_slip_nodes_are_tabulated_and_interpolated(led2gaze, tmp_path):
-    grid = Grid(**dict(TINY, slip_mm=((-1.0, 0.0, 1.0), (0.0,), (0.0,))))
+    slips = ((-1.0, 0.0, 1.0), (0.0,), (0.0,))
+    grid = Grid(**dict(TINY, slip_mm=slips, lid_opening=(1.0,), quality=()))
     path = response_map(led2gaze, Person(), cache=str(tmp_path), grid=grid)
-    moved = Scene(led2gaze, Person(), (0.5, 0, 0), grid.quality).response(5, 5, 3.5, 1.0)
-    still = Scene(led2gaze, Person(), quality=grid.quality).response(5, 5, 3.5, 1.0)
+    moved = Scene(led2gaze, Person(), (0.5, 0, 0)).response(5, 5, 3.5, 1.0)
+    still = Scene(led2gaze, Person()).response(5, 5, 3.5, 1.0)
     got = evaluate(path, [[5, 5, 3.5, 1.0, 0.5, 0, 0]])[0]
     assert np.abs(got - moved).max() < 0.1 * np.abs(moved - still).max()
 
