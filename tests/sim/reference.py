@@ -23,8 +23,8 @@ PERSON = (
     "cornea_radius_mm cornea_asphericity limbus_radius_mm limbus_blend_mm limbus_haze_mm globe_radius_mm"
     " iris_depth_mm kappa_azimuth_deg kappa_elevation_deg refractive_index roughness albedo_sclera"
     " albedo_iris albedo_skin lid_upper_deg lid_lower_deg canthus_deg canthus_tilt_deg lid_upper_follow"
-    " lid_lower_follow lid_close_at lid_thickness_mm lid_softness_mm lid_radius_mm brow_mm nose_mm cheek_mm lash_length_mm"
-    " lash_opacity"
+    " lid_lower_follow lid_close_at lid_thickness_mm lid_softness_mm lid_radius_mm brow_mm"
+    " nose_mm cheek_mm lash_length_mm lash_opacity"
 ).split()
 DECLARED = "struct ref_person { double %s; };" % ", ".join(PERSON) + """
 struct ref_port { double position[3], aim[3], sigma_deg, radius_mm; };
