@@ -100,11 +100,12 @@ def view_command(
     \b
     Example:
         sparsegaze view headsets/led2gaze.toml --sensor 3 --gaze 27,-20 -o view.png
-        sparsegaze view headsets/led2gaze.toml --sensor 3 --emitter 4 --gaze 10,0 -o one.png --npz one.npz
-        sparsegaze view headsets/led2gaze.toml --sensor 0 --person 7 --lids 0.4 -o lids.png
-    --npz FILE holds radiance and part_face .. part_glint (emitter, row, column; row 0 on top), window and
-    solid_angle (row, column), edges_tan; the signal of emitter e is (radiance[e] * window *
-    solid_angle).sum().
+        sparsegaze view headsets/led2gaze.toml --sensor 0 --emitter 4 --gaze 30,-6 -o smeared.png
+        sparsegaze view headsets/led2gaze.toml --sensor 4 --lids 0.6 -o lids.png --npz lids.npz
+
+    --npz FILE holds the linear floats: radiance and part_face .. part_glint (emitter, row, column; row 0 on
+    top), window and solid_angle (row, column), edges_tan. The signal of emitter e is
+    (radiance[e] * window * solid_angle).sum().
     """
     from .headset import load_headset
     from .image import view

@@ -250,15 +250,14 @@ def _draw_parts(axes, seen):
         loc="left",
         pad=22,
     )
-    left, at = 0.0, 0.0
-    for name, value in sums.items():
+    left = 0.0
+    for at, (name, value) in zip((0.0, 0.235, 0.505, 0.745), sums.items()):
         share = 100 * value / total if total else 0.0
         axes.barh(0, share, left=left, height=1, color=COLOURS[name], edgecolor=_PAPER, linewidth=1.5)
         left += share
         text = dict(transform=axes.transAxes, va="center", ha="left")
         axes.text(at, 1.22, "■", color=COLOURS[name], fontsize=11, **text)
         axes.text(at + 0.038, 1.22, "%s %.1f %%" % (name, share), color=INK, fontsize=9, **text)
-        at += 0.262
     axes.set_xlim(0, 100)
     axes.set_ylim(-0.5, 0.5)
     axes.set_yticks([])
