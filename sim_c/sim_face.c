@@ -8,7 +8,7 @@
 #define PI 3.14159265358979323846
 #define RADIANS (PI / 180)
 
-static const double BLEND = 3;                            // reach of the smooth maximum of bulge and orbit, mm
+static const double BLEND = 3;  // reach of the smooth maximum of bulge and orbit, mm
 static const double VIEW_ALPHA = 85 * RADIANS, VIEW_BETA = 70 * RADIANS;
 static const double SAMPLE_MM = 0.7;  // along a ray, seen from the front; the face has no finer features
 static const double TINY = 1e-6;      // fraction of a ray below which gap(u) / u would be rounding noise
@@ -103,7 +103,8 @@ struct sample {
 
 static struct sample sample_at(const struct ray *ray, double u) {
     double x = ray->x + u * ray->dx, y = ray->y + u * ray->dy;
-    double w = ray->part == SIM_PART_ALL ? sim_relief_height(ray->relief, x, y) : rest_height(ray->relief, x, y);
+    int all = ray->part == SIM_PART_ALL;
+    double w = all ? sim_relief_height(ray->relief, x, y) : rest_height(ray->relief, x, y);
     struct sample s = {u, (ray->height - w) / u + ray->rise};
     return s;
 }
@@ -111,7 +112,8 @@ static struct sample sample_at(const struct ray *ray, double u) {
 // Vertex of the parabola through three samples; 0 when it has none between them.
 static int vertex(struct sample a, struct sample b, struct sample c, struct sample *at) {
     double left = (b.g - a.g) / (b.u - a.u), right = (c.g - b.g) / (c.u - b.u);
-    double bend = (right - left) / (c.u - a.u), tilt = (left * (c.u - b.u) + right * (b.u - a.u)) / (c.u - a.u);
+    double bend = (right - left) / (c.u - a.u);
+    double tilt = (left * (c.u - b.u) + right * (b.u - a.u)) / (c.u - a.u);
     if (!(bend > 0) || !isfinite(bend)) return 0;
     at->u = b.u - tilt / (2 * bend);
     at->g = b.g - tilt * tilt / (4 * bend);
@@ -126,13 +128,21 @@ static double minimum(const struct ray *ray, struct sample a, struct sample b, s
         int curved = i % 4 != 3 && vertex(a, b, c, &v);
         if (curved && b.g - v.g < 1e-9 && i > 0) return v.g < b.g ? v.g : b.g;
         if (width < 1e-9) break;
-        double u = curved ? v.u : b.u - a.u > c.u - b.u ? b.u - 0.382 * (b.u - a.u) : b.u + 0.382 * (c.u - b.u);
+        double wider = b.u - a.u > c.u - b.u ? a.u - b.u : c.u - b.u;
+        double u = curved ? v.u : b.u + 0.382 * wider;
         if (fabs(u - b.u) < 1e-3 * width) u = b.u + (c.u - b.u > b.u - a.u ? 1e-3 : -1e-3) * width;
         struct sample s = sample_at(ray, u);
         if (s.g < b.g) {
-            if (s.u < b.u) c = b; else a = b;
+            if (s.u < b.u)
+                c = b;
+            else
+                a = b;
             b = s;
-        } else if (s.u < b.u) a = s; else c = s;
+        } else if (s.u < b.u) {
+            a = s;
+        } else {
+            c = s;
+        }
     }
     return b.g;
 }
@@ -153,8 +163,8 @@ double sim_relief_horizon(const struct sim_relief *relief, enum sim_part part, c
     }
     int n = (int)ceil(fmin(sqrt(ray.dx * ray.dx + ray.dy * ray.dy) * end / SAMPLE_MM, 2000));
     if (n < 2) n = 2;
-    // Samples are evenly spaced; some more before the first, where a hollow's far edge may begin to hide at once,
-    // and before the last.
+    // Samples are evenly spaced; some more before the first, where a hollow's far edge may begin to hide at
+    // once, and before the last.
     struct sample a, b = {0, at_zero}, c = {0, at_zero};
     for (int i = -3; i <= n + 1; ++i) {
         a = b;
@@ -269,7 +279,8 @@ void sim_face_close(struct sim_face *face) {
 }
 
 double sim_face_eye_reach(const struct sim_face *face, int site, double alpha, double beta) {
-    double i = (alpha / VIEW_ALPHA + 1) * (SIM_VIEW_ALPHAS / 2.0), j = (beta / VIEW_BETA + 1) * (SIM_VIEW_BETAS / 2.0);
+    double i = (alpha / VIEW_ALPHA + 1) * (SIM_VIEW_ALPHAS / 2.0);
+    double j = (beta / VIEW_BETA + 1) * (SIM_VIEW_BETAS / 2.0);
     if (i >= 0 && i < SIM_VIEW_ALPHAS && j >= 0 && j < SIM_VIEW_BETAS) {
         unsigned char seen = face->view[(site * SIM_VIEW_BETAS + (int)j) * SIM_VIEW_ALPHAS + (int)i];
         if (seen < 2) return seen;

@@ -3,13 +3,14 @@
 // Face and closed lids as one height field w(x, y) = -z over the frontal plane (mm, head frame, origin at the
 // centre of rotation): the lids' bulge, orbit, brow, nose and cheek, smooth everywhere and defined for all x
 // and y. Its skin is the rectangle SIM_SKIN_*; what an open eye cuts out of it is a soft mask that depends on
-// the lids' pose. What the face hides is soft as well, because a site is a lens and not a point: shadows' edges
-// are as wide as the lens makes them, so that integrals over the face are smooth in the site's position.
+// the lids' pose. What the face hides is soft as well, because a site is a lens and not a point: shadows'
+// edges are as wide as the lens makes them, so that integrals over the face are smooth in the site's
+// position.
 //
-// Horizon   H (mm) of a point P for a lens centre Q: how high the centre stands above the horizon that the face
-//           makes along the ray, inf over 0 < u <= 1 of gap(u) / u, gap(u) = the ray's height over w at the
-//           fraction u of the way. H < 0: the centre is hidden; the lens is wholly seen from H = +R on and
-//           wholly hidden from H = -R on.
+// Horizon   H (mm) of a point P for a lens centre Q: how high the centre stands above the horizon that the
+//           face makes along the ray, inf over 0 < u <= 1 of gap(u) / u, gap(u) = the ray's height over w at
+//           the fraction u of the way. H < 0: the centre is hidden; the lens is wholly seen from H = +R on
+//           and wholly hidden from H = -R on.
 #ifndef SIM_FACE_H
 #define SIM_FACE_H
 
@@ -64,8 +65,8 @@ double sim_relief_horizon(const struct sim_relief *relief, enum sim_part part, c
 // Height (mm, along -z) of a place above the tangent plane of the skin at a point of it.
 double sim_relief_tangent(const double skin[3], const double slope[2], const double to[3]);
 
-// Share of a lens (radius >= SIM_LEAST_LENS_MM) that the face leaves to a point of its skin, 0..1, relative to
-// what the point's own horizon leaves (which its cosine of incidence accounts for): S(1/2 + H / 2R) /
+// Share of a lens (radius >= SIM_LEAST_LENS_MM) that the face leaves to a point of its skin, 0..1, relative
+// to what the point's own horizon leaves (which its cosine of incidence accounts for): S(1/2 + H / 2R) /
 // S(1/2 + H0 / 2R), S = sim_step(); 1 where H0 <= -R.
 double sim_relief_share(const struct sim_relief *relief, const double skin[3], const double slope[2],
                         const double to[3], double lens);

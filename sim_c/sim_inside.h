@@ -99,10 +99,11 @@ int sim_prepare_face(struct sim_scene *scene);
 
 // One spot of the skin. Returns a bound on any pair's response per area of the frontal plane; what is below
 // dark_per_area is not looked into.
-double sim_skin_at(struct sim_scene *scene, double x, double y, double dark_per_area, struct sim_skin_spot *spot);
+double sim_skin_at(struct sim_scene *scene, double x, double y, double dark_per_area,
+                   struct sim_skin_spot *spot);
 
-// Keeps the spots that lids may cut, but for those without light (dark: of one spot, as a response). Returns 0, or
-// -1 for lack of memory.
+// Keeps the spots that lids may cut, but for those without light (dark: of one spot, as a response). Returns
+// 0, or -1 for lack of memory.
 int sim_keep_opening(struct sim_scene *scene, double dark);
 
 // out[sensors][emitters] -= what the open eye takes the place of.

@@ -2,10 +2,11 @@
 //
 // What open lids cut out of the skin's light: the integral of light times the lids' mask, for any pose.
 //
-// Light is smooth and known at spots that stay; the mask has edges a fraction of a millimetre wide, and moves.
-// Along x the midpoint rule serves: margins run across the columns, and after integration over y nothing sharp is
-// left. Along y the mask is sampled SIM_SUB times per spot where it is neither 0 nor 1, and each sample's weight
-// is spread over the six spots about it as interpolation (Lagrange, degree 5) of the light wants.
+// Light is smooth and known at spots that stay; the mask has edges a fraction of a millimetre wide, and
+// moves. Along x the midpoint rule serves: margins run across the columns, and after integration over y
+// nothing sharp is left. Along y the mask is sampled SIM_SUB times per spot where it is neither 0 nor 1,
+// and each sample's weight is spread over the six spots about it as interpolation (Lagrange, degree 5) of
+// the light wants.
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
@@ -80,8 +81,8 @@ void sim_cut_opening(const struct sim_scene *scene, const struct sim_lid *lid, d
     }
 }
 
-// Spacing of the spots: a fraction of the narrowest spot of light on the lids, and such that the mask is sampled
-// often enough for the margins' softness.
+// Spacing of the spots: a fraction of the narrowest spot of light on the lids, and such that the mask is
+// sampled often enough for the margins' softness.
 static double lid_step(const struct sim_scene *scene) {
     double step = fmin(0.4, 0.5 * scene->person.lid_softness_mm);
     for (int p = 0; p < scene->n_sensors + scene->n_emitters; ++p) {
@@ -101,8 +102,8 @@ static struct sim_lid_spot seen_at(const struct sim_scene *scene, double x, doub
     double head[3] = {x, y, -sim_relief_height(&scene->face.relief, x, y)};
     if (head[2] >= -1 || y <= SIM_SKIN_Y_FROM || y >= SIM_SKIN_Y_TO) return seen;
     seen.rho = sim_lid_locate(head, &point, &seen.alpha, &seen.beta);
-    if (fabs(seen.alpha) >= (scene->person.canthus_deg + 4) * SIM_RADIANS || fabs(seen.beta) >= 65 * SIM_RADIANS)
-        seen.beta = NO_LID;
+    double canthus = (scene->person.canthus_deg + 4) * SIM_RADIANS;
+    if (fabs(seen.alpha) >= canthus || fabs(seen.beta) >= 65 * SIM_RADIANS) seen.beta = NO_LID;
     return seen;
 }
 
@@ -118,8 +119,9 @@ static int grow(struct sim_scene *scene, int *room) {
 
 // Spots at one step. *narrow: whether a shadow crosses one whose edge such a step may pass over.
 static int keep_columns(struct sim_scene *scene, double wanted, double dark, int *narrow) {
-    int n = (int)ceil((SIM_SKIN_X_TO - SIM_SKIN_X_FROM) / wanted), rows = n + 2 * SIDE, room = scene->n_lid_spots;
-    double step = (SIM_SKIN_X_TO - SIM_SKIN_X_FROM) / n, area = step * step;
+    double side = SIM_SKIN_X_TO - SIM_SKIN_X_FROM;  // and SIM_SKIN_Y_TO - SIM_SKIN_Y_FROM: the skin is square
+    int n = (int)ceil(side / wanted), rows = n + 2 * SIDE, room = scene->n_lid_spots;
+    double step = side / n, area = step * step;
     size_t ports = (size_t)(scene->n_sensors + scene->n_emitters);
     struct sim_lid_column *columns = realloc(scene->lid_columns, (size_t)n * sizeof *columns);
     double *parts = malloc((size_t)rows * ports * sizeof *parts);
@@ -133,11 +135,13 @@ static int keep_columns(struct sim_scene *scene, double wanted, double dark, int
         for (int j = 0; j < rows; ++j) {
             struct sim_skin_spot spot;
             double y = SIM_SKIN_Y_FROM + (j - SIDE + 0.5) * step;
-            double bright = area * sim_skin_at(scene, x, y, dark / area, &spot), *part = parts + (size_t)j * ports;
+            double bright = area * sim_skin_at(scene, x, y, dark / area, &spot);
+            double *part = parts + (size_t)j * ports;
             double weight = area * spot.stretch * scene->person.albedo_skin / PI;
             for (int s = 0; s < scene->n_sensors; ++s) part[s] = weight * spot.sensor_part[s];
             memcpy(part + scene->n_sensors, spot.emitter_part, (size_t)scene->n_emitters * sizeof *part);
-            if (j < SIDE || j >= rows - SIDE || bright <= dark || seen_at(scene, x, y).beta == NO_LID) continue;
+            if (j < SIDE || j >= rows - SIDE || bright <= dark) continue;
+            if (seen_at(scene, x, y).beta == NO_LID) continue;
             if (first == rows) first = j;
             last = j;
             *narrow |= spot.penumbra;

@@ -46,7 +46,8 @@ static int check_person(const struct sim_person *p, char *error, size_t bytes) {
     for (size_t i = 0; i < sizeof number / sizeof *number; ++i)
         if (!isfinite(number[i])) return refuse(error, bytes, "a number of the person is not finite");
     for (size_t i = 0; i < sizeof number / sizeof *number; ++i)
-        if (fabs(number[i]) > WILDEST) return refuse(error, bytes, "a number of the person is beyond all anatomy");
+        if (fabs(number[i]) > WILDEST)
+            return refuse(error, bytes, "a number of the person is beyond all anatomy");
     if (fabs(p->kappa_azimuth_deg) > 45 || fabs(p->kappa_elevation_deg) > 45)
         return refuse(error, bytes, "kappa is beyond 45 degrees");
     if (fabs(p->brow_mm) > 60 || fabs(p->nose_mm) > 60 || fabs(p->cheek_mm) > 60)
@@ -114,7 +115,8 @@ static int check_port(const struct sim_scene *scene, const double at[3], const s
     else if (distance < nearest + 0.2) why = "is inside the eyeball or touches it at some gaze";
     else if (-at[2] < sim_face_height(p, at[0], at[1]) + 0.2) why = "is inside or behind the face";
     else if (!(port->radius_mm >= 0)) why = "has a lens of negative radius";
-    else if (!(port->radius_mm < distance / 4)) why = "has a lens too large for its distance (a quarter of it)";
+    else if (!(port->radius_mm < distance / 4))
+        why = "has a lens too large for its distance (a quarter of it)";
     else if (touches(scene, at, port)) why = "has a lens that reaches into the eye or the face";
     if (!why) return 0;
     snprintf(text, sizeof text, "%s %d %s", what, number, why);
@@ -207,7 +209,8 @@ static int site_of(const struct sim_scene *scene, int emitter, int number) {
     return emitter ? scene->emitters[number].site : scene->sensors[number].site;
 }
 
-int sim_scene_port_facts(const struct sim_scene *scene, int emitter, int number, struct sim_port_facts *facts) {
+int sim_scene_port_facts(const struct sim_scene *scene, int emitter, int number,
+                         struct sim_port_facts *facts) {
     int site = site_of(scene, emitter, number);
     if (site < 0) return -1;
     facts->eye_clear = scene->face.eye_clear[site];

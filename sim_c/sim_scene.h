@@ -47,7 +47,7 @@ struct sim_scene;
 
 struct sim_quality sim_quality_default(void);
 
-// Check and prepare a scene: casts the face's visibility rays (about 0.1 s), nothing else does later.
+// Check and prepare a scene: integrates the skin, shadows and all (about 0.1 s); nothing does so later.
 //   slip_mm   added to every port's position; NULL = none.
 //   error     receives one line when the scene is impossible: a port inside the eye or the face, a number
 //             that is not
@@ -86,7 +86,8 @@ struct sim_face_facts {
 };
 
 // Facts about a sensor (emitter = 0) or an emitter (1). Returns 0, or -1 when there is no such port.
-int sim_scene_port_facts(const struct sim_scene *scene, int emitter, int number, struct sim_port_facts *facts);
+int sim_scene_port_facts(const struct sim_scene *scene, int emitter, int number,
+                         struct sim_port_facts *facts);
 void sim_scene_face_facts(const struct sim_scene *scene, struct sim_face_facts *facts);
 
 // Share of a port's lens that the face leaves to the eye in the direction (alpha to +x, beta up, as the lids
@@ -118,9 +119,9 @@ void sim_scene_glint_counts(const struct sim_scene *scene, long long counts[3]);
 // Height of the face over the frontal plane (mm forward of the centre of rotation), for pictures and checks.
 double sim_person_face_mm(const struct sim_person *person, double x_mm, double y_mm);
 
-// H (mm) of sim_face.h: how high a place stands above the horizon that the face makes for a point. relief_only: 0
-// for a point of the skin, with all of the face; 1 for a point above the orbit, without the lids' bulge. For
-// checks and pictures.
+// H (mm) of sim_face.h: how high a place stands above the horizon that the face makes for a point.
+// relief_only: 0 for a point of the skin, with all of the face; 1 for a point above the orbit, without the
+// lids' bulge. For checks and pictures.
 double sim_person_horizon_mm(const struct sim_person *person, const double from_mm[3], const double to_mm[3],
                              int relief_only);
 

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The skin's term: the whole face with closed lids, integrated once, less what an open eye takes the place of.
+// The skin's term: the whole face with closed lids, integrated once, less what an open eye takes the place
+// of.
 //
 // The first integrand is smooth but for penumbras and kinks of the relief's third derivatives: Gauss panels,
 // halved where halving changes any pair's sum. What the eye takes is sim_opening.c's.
@@ -38,7 +39,8 @@ struct work {
     double most_spots;  // give up beyond
 };
 
-double sim_skin_at(struct sim_scene *scene, double x, double y, double dark_per_area, struct sim_skin_spot *spot) {
+double sim_skin_at(struct sim_scene *scene, double x, double y, double dark_per_area,
+                   struct sim_skin_spot *spot) {
     const struct sim_face *face = &scene->face;
     spot->position[0] = x;
     spot->position[1] = y;
@@ -51,7 +53,8 @@ double sim_skin_at(struct sim_scene *scene, double x, double y, double dark_per_
     double transfer[2 * SIM_MAX_PORTS], away[2 * SIM_MAX_PORTS][3];
     double distance[2 * SIM_MAX_PORTS], share[2 * SIM_MAX_PORTS];
     for (int k = 0; k < scene->n_sites; ++k) {
-        transfer[k] = sim_surface_transfer(&scene->sites[k], spot->position, spot->normal, away[k], distance + k);
+        const struct sim_site *site = &scene->sites[k];
+        transfer[k] = sim_surface_transfer(site, spot->position, spot->normal, away[k], distance + k);
         share[k] = -1;
     }
     sim_ports_at(scene, transfer, away, spot->sensor_part, spot->emitter_part);
@@ -65,7 +68,8 @@ double sim_skin_at(struct sim_scene *scene, double x, double y, double dark_per_
         int k = sensing ? scene->sensors[p].site : scene->emitters[e].site;
         if (weight * *part * (sensing ? lit : sensed) <= dark_per_area) continue;
         if (share[k] < 0) {
-            share[k] = sim_relief_share(&face->relief, spot->position, spot->slope, face->sites[k], face->lens[k]);
+            share[k] = sim_relief_share(&face->relief, spot->position, spot->slope, face->sites[k],
+                                        face->lens[k]);
             int partly = share[k] > 0 && share[k] < 1;
             scene->skin_facts.penumbra[k] |= partly;
             spot->penumbra |= partly && face->lens[k] * NEAR_MM < 0.6 * distance[k];
@@ -154,8 +158,8 @@ static void integrate_all(struct work *work) {
     double half = (SIM_SKIN_X_TO - SIM_SKIN_X_FROM) / (2 * BASE_PANELS);
     for (int j = 0; j < BASE_PANELS; ++j)
         for (int i = 0; i < BASE_PANELS; ++i)
-            integrate(work, SIM_SKIN_X_FROM + (2 * i + 1) * half, SIM_SKIN_Y_FROM + (2 * j + 1) * half, half, 0,
-                      NULL);
+            integrate(work, SIM_SKIN_X_FROM + (2 * i + 1) * half, SIM_SKIN_Y_FROM + (2 * j + 1) * half, half,
+                      0, NULL);
 }
 
 static double mean_of_pairs(const struct sim_scene *scene) {

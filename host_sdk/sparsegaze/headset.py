@@ -28,21 +28,21 @@ _REMEDY = "see headsets/led2gaze.toml for a complete example"
 
 @dataclass(frozen=True)
 class Port:
-    """One sensor or one emitter. Position and aim (unit vector) in the headset's frame; sigma as in the
-    file.
-    """
+    """One sensor or one emitter."""
 
-    position_mm: Tuple[float, float, float]
-    aim: Tuple[float, float, float]
-    sigma_deg: float
-    lens_radius_mm: float
-    current_ma: float = 20.0
+    position_mm: Tuple[float, float, float]  # of the lens's centre, mm, headset frame
+    aim: Tuple[float, float, float]  # unit vector along its axis, headset frame, no unit
+    sigma_deg: float  # response or beam exp(-tan^2(angle) / (2 tan^2 sigma)), 0.5..85 degrees
+    lens_radius_mm: float  # of the part of the lens that glows or collects, mm; 0 = a point
+    current_ma: float = 20.0  # an emitter's, mA; the simulator's response is per unit intensity
 
 
 @dataclass(frozen=True)
 class Headset:
-    """Sensors and emitters in file order; `wiring` has each entry's other keys (pins, resistor) by entry
-    name.
+    """Sensors and emitters in file order.
+
+    board    the file's [board] table: what drives it, no units
+    wiring   each entry's other keys by entry name (pins as text, *_ohm in ohm, *_deg, *_mm, *_ma as named)
     """
 
     name: str
