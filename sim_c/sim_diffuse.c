@@ -56,7 +56,8 @@ double sim_surface_transfer(const struct sim_site *site, const double point[3], 
 }
 
 // A port's narrowness where its axis comes nearest to the eye's centre; a site's where it is above the eye.
-static int focus_on(const double at[3], double scale, double reach_mm, double globe, struct sim_focus *focus) {
+static int focus_on(const double at[3], double scale, double reach_mm, double globe,
+                    struct sim_focus *focus) {
     double size = sqrt(sim_dot(at, at)) + 1e-9;
     if (scale > 3) return 0;
     focus->alpha = atan2(at[0], -at[2]);
@@ -69,7 +70,8 @@ static int focus_on(const double at[3], double scale, double reach_mm, double gl
 static void find_foci(const struct sim_scene *scene, struct sim_light *light) {
     double globe = scene->eye.globe;
     for (int i = 0; i < scene->n_sensors + scene->n_emitters; ++i) {
-        const struct sim_window *w = i < scene->n_sensors ? &scene->sensors[i] : &scene->emitters[i - scene->n_sensors];
+        int e = i - scene->n_sensors;
+        const struct sim_window *w = e < 0 ? &scene->sensors[i] : &scene->emitters[e];
         const double *from = scene->sites[w->site].position;
         double nearest = -sim_dot(from, w->aim), miss2 = sim_dot(from, from) - nearest * nearest;
         double inside = globe * globe - miss2, length = nearest - (inside > 0 ? sqrt(inside) : 0), at[3];
@@ -87,7 +89,8 @@ static void find_foci(const struct sim_scene *scene, struct sim_light *light) {
 }
 
 static int by_place(const void *a, const void *b) {
-    const struct sim_site *one = *(const struct sim_site *const *)a, *other = *(const struct sim_site *const *)b;
+    const struct sim_site *one = *(const struct sim_site *const *)a;
+    const struct sim_site *other = *(const struct sim_site *const *)b;
     for (int k = 0; k < 3; ++k)
         if (one->position[k] != other->position[k]) return one->position[k] < other->position[k] ? -1 : 1;
     return (one->radius > other->radius) - (one->radius < other->radius);
@@ -121,8 +124,8 @@ void sim_light_close(struct sim_light *light) {
     free(light->order);
 }
 
-SIM_WIDE static void weigh_window(const struct sim_window *window, const double *away, const double *transfer,
-                                  int n, double *part) {
+SIM_WIDE static void weigh_window(const struct sim_window *window, const double *away,
+                                  const double *transfer, int n, double *part) {
     const double *x = away, *y = away + SIM_BATCH, *z = away + 2 * SIM_BATCH;
     double ax = -window->aim[0], ay = -window->aim[1], az = -window->aim[2], per_tan2 = window->per_tan2;
     SIM_EACH(p, n)
@@ -147,8 +150,8 @@ void sim_light_windows(const struct sim_scene *scene, struct sim_light *light, i
     }
 }
 
-SIM_WIDE static void add_rows(const double *sensor, const double *emitters, const double *weight, int n, int m,
-                              double *out) {
+SIM_WIDE static void add_rows(const double *sensor, const double *emitters, const double *weight, int n,
+                              int m, double *out) {
     double here[SIM_BATCH];
     SIM_EACH(p, n) here[p] = weight[p] * sensor[p];
     for (int e = 0; e < m; ++e) {
@@ -170,7 +173,8 @@ void sim_light_pairs(const struct sim_scene *scene, const double *part, const do
 
 void sim_break_add(struct sim_breaks *breaks, double at, double apart) {
     double from = breaks->at[0], to = breaks->at[breaks->n - 1];
-    if (!(at > from + apart && at < to - apart) || breaks->n == (int)(sizeof breaks->at / sizeof *breaks->at)) return;
+    const int most = (int)(sizeof breaks->at / sizeof *breaks->at);
+    if (!(at > from + apart && at < to - apart) || breaks->n == most) return;
     for (int i = 1; i + 1 < breaks->n; ++i)
         if (fabs(breaks->at[i] - at) < apart) return;
     int i = breaks->n++;
@@ -178,8 +182,8 @@ void sim_break_add(struct sim_breaks *breaks, double at, double apart) {
     breaks->at[i] = at;
 }
 
-void sim_break_changes(struct sim_breaks *breaks, const double *value, const double *lower, const double *upper,
-                       int direction, double from, double step) {
+void sim_break_changes(struct sim_breaks *breaks, const double *value, const double *lower,
+                       const double *upper, int direction, double from, double step) {
     for (int p = 0; p + 1 < SIM_SAMPLES; ++p) {
         if ((value[p] < 0) == (value[p + 1] < 0)) continue;
         if (direction && direction * (value[p + 1] - value[p]) > 0) continue;
@@ -248,7 +252,8 @@ int sim_scene_smooth(const struct sim_scene *scene, double azimuth_deg, double e
     memset(out, 0, (size_t)n_pupils * block * sizeof *out);
     int bad = sim_light_open(&light, scene);
     for (int l = 0; !bad && l < n_lids; ++l) {
-        if (terms & SIM_TERM_FACE) sim_add_face(scene, elevation_deg, lid_opening[l], out + (size_t)l * pairs);
+        double *at = out + (size_t)l * pairs;
+        if (terms & SIM_TERM_FACE) sim_add_face(scene, elevation_deg, lid_opening[l], at);
         if (terms & SIM_TERM_SCLERA)
             sim_add_sclera(scene, &light, axes, elevation_deg, lid_opening[l], out + (size_t)l * pairs);
     }

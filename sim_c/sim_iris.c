@@ -7,9 +7,10 @@
 #include "sim_wide.h"
 
 #define PI 3.14159265358979323846
-// At fineness 1: nodes of a piece of a row, mm between them; where the veil or a lid's edge is in mm per haze and
-// softness; nodes of a piece across the rows, mm between rows.
-static const double NODES_ROW = 3, STEP_ROW = 1.0, STEP_VEIL = 0.4, STEP_EDGE = 0.3, NODES_ACROSS = 3, STEP_ACROSS = 0.9;
+// At fineness 1: nodes of a piece of a row, mm between them; where the veil or a lid's edge is in mm per haze
+// and softness; nodes of a piece across the rows, mm between rows.
+static const double NODES_ROW = 3, STEP_ROW = 1.0, STEP_VEIL = 0.4, STEP_EDGE = 0.3;
+static const double NODES_ACROSS = 3, STEP_ACROSS = 0.9;
 static const double STEP_FOCUS = 0.8;  // between points, in standard deviations of the narrowest window
 static const double SETTLED_MM = 1e-6;
 enum { NEWTON_STEPS = 6, PROBE_STEPS = 3 };
@@ -35,8 +36,8 @@ struct path {
     double gx, gy, hxx, hyy, hxy, per1, per2, ux, uy, uz, vx, vy, vz, zx, zy, z;
 };
 
-SIM_INLINE struct path measure(const struct sim_eye *eye, const double site[3], double sx, double sy, double x,
-                               double y) {
+SIM_INLINE struct path measure(const struct sim_eye *eye, const double site[3], double sx, double sy,
+                               double x, double y) {
     struct path t;
     double n = eye->index, r2 = x * x + y * y, root = sqrt(eye->radius * eye->radius - eye->p * r2);
     double per_root = 1 / root, cube = eye->p * per_root * per_root * per_root;
@@ -63,7 +64,7 @@ SIM_INLINE struct path measure(const struct sim_eye *eye, const double site[3], 
     return t;
 }
 
-// As sim_eye_refract(), a fixed number of Newton's steps from its first guess. `step` and `least` say how well
+// As sim_eye_refract(), a fixed number of Newton's steps from a first guess. `step` and `least` say how well
 // each has settled: what the next step would be (mm), and the Hessian's lower eigenvalue.
 SIM_WIDE static void refract(const struct sim_eye *eye, const double site[3], int steps, struct spots *s,
                              double *transfer) {
@@ -74,7 +75,8 @@ SIM_WIDE static void refract(const struct sim_eye *eye, const double site[3], in
     double *x = s->exit[0], *y = s->exit[1], *z = s->exit[2];
     SIM_EACH(p, n) {  // bend the straight way as the cornea above the spot would
         double sx = s->x[p], sy = s->y[p], dx = site[0] - sx, dy = site[1] - sy, r2 = sx * sx + sy * sy;
-        double root = sqrt(r_apex2 - conic * r2), height = sim_wide_max(depth - r2 / (apex_radius + root), 0.1);
+        double root = sqrt(r_apex2 - conic * r2);
+        double height = sim_wide_max(depth - r2 / (apex_radius + root), 0.1);
         double per = 1 / sqrt(dx * dx + dy * dy + dz * dz), per_normal = 1 / sqrt(r2 + root * root);
         double nx = sx * per_normal, ny = sy * per_normal, nz = root * per_normal;
         double cosine = sim_wide_max((dx * nx + dy * ny + dz * nz) * per, 0.0);
@@ -105,7 +107,8 @@ SIM_WIDE static void refract(const struct sim_eye *eye, const double site[3], in
         double cos_out = (t.zx * t.ux + t.zy * t.uy - t.uz) * per_size;
         double cos_in = (t.vz - t.zx * t.vx - t.zy * t.vy) * per_size;
         double c = sim_wide_max(cos_out, 0.0), inside = sqrt(1 - (1 - c * c) / (index * index));
-        double across = (c - index * inside) / (c + index * inside), along = (inside - index * c) / (inside + index * c);
+        double across = (c - index * inside) / (c + index * inside);
+        double along = (inside - index * c) / (inside + index * c);
         double through = 1 - (across * across + along * along) / 2;
         double r = sqrt(x[p] * x[p] + y[p] * y[p]);
         double veil = 1 - sim_wide_step((r - eye->limbus) / eye->haze + 0.5);
@@ -122,7 +125,8 @@ static void mend(const struct sim_eye *eye, const double site[3], struct spots *
         double spot[3] = {s->x[p], s->y[p], eye->iris_z}, exit[3];
         double t = sim_eye_refract(eye, site, spot, exit);
         for (int k = 0; k < 3; ++k) s->exit[k][p] = exit[k];
-        transfer[p] = t > 0 ? t * (1 - sim_eye_whiteness(eye, sqrt(exit[0] * exit[0] + exit[1] * exit[1]))) : 0;
+        double r = sqrt(exit[0] * exit[0] + exit[1] * exit[1]);
+        transfer[p] = t > 0 ? t * (1 - sim_eye_whiteness(eye, r)) : 0;
     }
     for (int p = s->n; p < sim_whole(s->n); ++p) transfer[p] = 0;
 }
@@ -177,12 +181,14 @@ SIM_WIDE static void open_toward(const struct sim_lid *lid, const struct sim_lig
     const double *alpha = light->alpha + k * SIM_BATCH, *beta = light->beta + k * SIM_BATCH;
     const double *rho = light->distance + k * SIM_BATCH;
     const double *out = light->out + k * SIM_BATCH, *tangent = light->tangent + k * SIM_BATCH;
-    double per_half2 = 1 / (lid->half * lid->half), thickness = lid->thickness, per_softness = 1 / lid->softness;
+    double per_half2 = 1 / (lid->half * lid->half), thickness = lid->thickness;
+    double per_softness = 1 / lid->softness;
     double tilt = lid->tilt, upper = lid->upper, lower = lid->lower;
     SIM_EACH(p, n) {
         double slope = -2 * alpha[p] * per_half2, arch = 1 - alpha[p] * alpha[p] * per_half2;
         double line = tilt * alpha[p], b = beta[p];
-        double per_cos = 1 / wide_cosine(b), su = (tilt + upper * slope) * per_cos, sl = (tilt + lower * slope) * per_cos;
+        double per_cos = 1 / wide_cosine(b);
+        double su = (tilt + upper * slope) * per_cos, sl = (tilt + lower * slope) * per_cos;
         double above = rho[p] * (line + upper * arch - b) / sqrt(1 + su * su);
         double below = rho[p] * (b - line - lower * arch) / sqrt(1 + sl * sl);
         open[p] = sim_wide_open(thickness, per_softness, above, below, out[p], tangent[p]);
@@ -190,7 +196,8 @@ SIM_WIDE static void open_toward(const struct sim_lid *lid, const struct sim_lig
 }
 
 // The same through the lashes.
-SIM_WIDE static void dim(const struct sim_lid *lid, const struct sim_light *light, int k, int n, double *open) {
+SIM_WIDE static void dim(const struct sim_lid *lid, const struct sim_light *light, int k, int n,
+                         double *open) {
     const double *alpha = light->alpha + k * SIM_BATCH, *beta = light->beta + k * SIM_BATCH;
     const double *rho = light->distance + k * SIM_BATCH;
     const double *out = light->out + k * SIM_BATCH, *tangent = light->tangent + k * SIM_BATCH;
@@ -238,7 +245,8 @@ static void flush(struct iris *iris) {
             int e = i - scene->n_sensors, site = e < 0 ? scene->sensors[i].site : scene->emitters[e].site;
             shade(light->part + i * SIM_BATCH, open + site * SIM_BATCH, whole, light->shown + i * SIM_BATCH);
         }
-        sim_light_pairs(scene, light->shown, s->weight, s->n, iris->ring + l * scene->n_sensors * scene->n_emitters);
+        double *ring = iris->ring + l * scene->n_sensors * scene->n_emitters;
+        sim_light_pairs(scene, light->shown, s->weight, s->n, ring);
     }
     s->n = 0;
 }
@@ -315,7 +323,8 @@ static void add_row(struct iris *iris, double radius, double u, double weight, d
         sim_break_add(&breaks, clear, 0.1);
     }
     for (int i = 0; i + 1 < breaks.n; ++i) {
-        double at = (breaks.at[i] + breaks.at[i + 1]) / 2, length = breaks.at[i + 1] - breaks.at[i], h = fmin(step_mm, STEP_ROW);
+        double at = (breaks.at[i] + breaks.at[i + 1]) / 2, length = breaks.at[i + 1] - breaks.at[i];
+        double h = fmin(step_mm, STEP_ROW);
         if (at < from || at > to) continue;
         if (fabs(at) > clear) h = fmin(h, STEP_VEIL * eye->haze);
         if (at < edge_from || at > edge_to) h = fmin(h, STEP_EDGE * iris->lids[0].softness);
@@ -368,20 +377,22 @@ static void add_disc(struct iris *iris, double radius, double factor, double ste
     for (int piece = 0; piece + 1 < breaks.n; ++piece) {
         int parts;
         double from = breaks.at[piece], length = breaks.at[piece + 1] - from;
-        double want = NODES_ACROSS + radius * length / fmin(step_mm, STEP_ACROSS);
+        double step = fmin(step_mm, iris->n_lids > 2 ? 0.6 * STEP_ACROSS : STEP_ACROSS);
+        double want = NODES_ACROSS + radius * length / step;
         int n = sim_nodes_for(iris->scene->quality.iris * want, &parts);
         const double *rule = iris->scene->rule[n];
         double half = length / (2 * parts);
         for (int i = 0; i < n * parts; ++i) {
             double t = from + half * (2 * (i / n) + 1 + rule[i % n]);
-            add_row(iris, radius, radius * sin(t), factor * radius * cos(t) * half * rule[n + i % n], step_mm);
+            double weight = factor * radius * cos(t) * half * rule[n + i % n];
+            add_row(iris, radius, radius * sin(t), weight, step_mm);
         }
     }
     flush(iris);
 }
 
-// The iris of a pupil is the disc within the limbus less that within the pupil: nothing but the domain depends
-// on the pupil.
+// The iris of a pupil is the disc within the limbus less that within the pupil: nothing but the domain
+// depends on the pupil.
 int sim_add_iris(const struct sim_scene *scene, struct sim_light *light, const double axes[9],
                  double elevation_deg, const double *pupil_mm, int n_pupils, const double *lid_opening,
                  int n_lids, double *out) {

@@ -63,7 +63,8 @@ SIM_WIDE static void place(const struct sim_eye *eye, const struct sim_lid *lid,
     }
     double b = eye->radius - eye->p * eye->apex, rest = eye->apex * (2 * eye->radius - eye->p * eye->apex);
     double per_haze = 1 / eye->haze, from_haze = 0.5 - eye->limbus / eye->haze, per_blend = 1 / eye->blend;
-    double globe = eye->globe, sixth = eye->blend / 6, p1 = eye->p, tilt = lid->tilt, lid_u = lid->upper, lid_l = lid->lower;
+    double globe = eye->globe, sixth = eye->blend / 6, p1 = eye->p;
+    double tilt = lid->tilt, lid_u = lid->upper, lid_l = lid->lower;
     double per_half2 = 1 / (lid->half * lid->half);
     SIM_EACH(p, n) {
         double sa = row0[p], ca = row1[p], beta = beta_of[p], alpha = alpha_of[p];
@@ -82,7 +83,8 @@ SIM_WIDE static void place(const struct sim_eye *eye, const struct sim_lid *lid,
         double tissue = sim_wide_step(rho * sine * per_haze + from_haze), white = c > 0 ? tissue : 1.0;
         // Area vector rho (rho e_r - rho' e_theta) per unit solid angle; e_theta = (cos e_r - axis) / sine.
         double cut = rho_d / (sine + 1e-12), along = rho - cut * c;
-        double n0 = along * e0 + cut * axes[2], n1 = along * e1 + cut * axes[5], n2 = along * e2 + cut * axes[8];
+        double n0 = along * e0 + cut * axes[2], n1 = along * e1 + cut * axes[5];
+        double n2 = along * e2 + cut * axes[8];
         double length = sqrt(n0 * n0 + n1 * n1 + n2 * n2), per_length = 1 / length;
         normal0[p] = n0 * per_length;
         normal1[p] = n1 * per_length;
@@ -180,7 +182,8 @@ static void flush(struct sweep *sweep) {
     }
     place(&scene->eye, &sweep->lid, sweep->axes, scene->person.albedo_sclera / PI, s);
     for (int k = 0; k < scene->n_sites; ++k) {
-        double *transfer = sweep->light->transfer + k * SIM_BATCH, *away = sweep->light->away + 3 * k * SIM_BATCH;
+        double *transfer = sweep->light->transfer + k * SIM_BATCH;
+        double *away = sweep->light->away + 3 * k * SIM_BATCH;
         reach(scene, &scene->sites[k], sweep->bulge, &sweep->lid, s, away, transfer);
         if (sweep->lid.lash_opacity > 0) dim(&sweep->lid, s, away, transfer);
         if (scene->face.eye_clear[k]) continue;
@@ -193,7 +196,8 @@ static void flush(struct sweep *sweep) {
 }
 
 // The closest points that any focus asks for in a box of directions, mm.
-static double spacing(const struct sim_light *light, double a0, double a1, double b0, double b1, double widest) {
+static double spacing(const struct sim_light *light, double a0, double a1, double b0, double b1,
+                      double widest) {
     for (int i = 0; i < light->n_foci; ++i) {
         const struct sim_focus *f = &light->foci[i];
         if (f->alpha + f->reach < a0 || f->alpha - f->reach > a1) continue;
@@ -203,8 +207,8 @@ static double spacing(const struct sim_light *light, double a0, double a1, doubl
     return widest;
 }
 
-static void add_piece(struct sweep *sweep, const double row[2], double alpha, double weight, double from, double to,
-                      double step_mm) {
+static void add_piece(struct sweep *sweep, const double row[2], double alpha, double weight, double from,
+                      double to, double step_mm) {
     const struct sim_scene *scene = sweep->scene;
     double globe = scene->eye.globe, length = (to - from) * globe, reach_a = 0.5 / globe;
     double h = spacing(sweep->light, alpha - reach_a, alpha + reach_a, from, to, step_mm);
@@ -286,7 +290,8 @@ static void survey(struct sweep *sweep, double *open, double *full) {
         sim_lid_margins(&sweep->lid, alpha, &upper, &lower);
         probe_column(sweep, alpha, lower, upper);
         for (int k = 0; k < scene->n_sites; ++k) {
-            look(sweep->light->order[k], &sweep->lid, scene->eye.radius, sweep->bulge, &sweep->probe, &column);
+            look(sweep->light->order[k], &sweep->lid, scene->eye.radius, sweep->bulge, &sweep->probe,
+                 &column);
             *open++ = sim_most_of_both(column.lower, column.upper);
             *full++ = sim_most_of_both(column.full_lower, column.full_upper);
         }
@@ -302,7 +307,8 @@ static void add_row(struct sweep *sweep, double alpha, double weight) {
     if (upper <= lower) return;
     struct sim_breaks breaks = {2, {lower, upper}};
     struct column column;
-    double from = upper, to = lower, edge_from = lower, edge_to = upper, step = (upper - lower) / (SIM_SAMPLES - 1);
+    double from = upper, to = lower, edge_from = lower, edge_to = upper;
+    double step = (upper - lower) / (SIM_SAMPLES - 1);
     probe_column(sweep, alpha, lower, upper);
     for (int k = 0; k < scene->n_sites; ++k) {
         look(sweep->light->order[k], lid, eye->radius, sweep->bulge, &sweep->probe, &column);
@@ -328,8 +334,9 @@ static void add_row(struct sweep *sweep, double alpha, double weight) {
     sim_break_add(&breaks, edge_from, APART);
     sim_break_add(&breaks, edge_to, APART);
     // e(beta) . axis = size cos(beta - middle): circles about the axis.
-    double u = row[0] * sweep->axes[2] - row[1] * sweep->axes[8], v = sweep->axes[5], size = sqrt(u * u + v * v);
-    double middle = atan2(v, u), reach_of[3] = {0, 0, 0}, cosine[3] = {eye->cos_clear, eye->cos_white, eye->cos_blend};
+    double u = row[0] * sweep->axes[2] - row[1] * sweep->axes[8], v = sweep->axes[5];
+    double size = sqrt(u * u + v * v), middle = atan2(v, u), reach_of[3] = {0, 0, 0};
+    const double cosine[3] = {eye->cos_clear, eye->cos_white, eye->cos_blend};
     for (int i = 0; i < 3; ++i) {
         if (size <= fabs(cosine[i])) continue;
         reach_of[i] = acos(cosine[i] / size);
@@ -367,7 +374,8 @@ void sim_add_sclera(const struct sim_scene *scene, struct sim_light *light, cons
                           .fineness = scene->quality.sclera};
     sim_lid_pose(&sweep.lid, &scene->person, elevation_deg, opening);
     for (int k = 0; k < 3; ++k) sweep.bulge[k] = (eye->apex - eye->radius) * axes[3 * k + 2];
-    double half = sweep.lid.half, ay2 = axes[5] * axes[5], middle = atan2(axes[2], -axes[8]), reach_of[2] = {0, 0};
+    double half = sweep.lid.half, ay2 = axes[5] * axes[5], middle = atan2(axes[2], -axes[8]);
+    double reach_of[2] = {0, 0};
     int sites = scene->n_sites;
     double *open = light->survey, *full = open + SIM_COLUMNS * sites, from = half, to = -half, a, b;
     survey(&sweep, open, full);

@@ -175,8 +175,8 @@ double sim_most_of_both(const double *a, const double *b);
 
 // Breaks where a value changes sign between samples at which both `lower` and `upper` are not below 0;
 // direction 1 or -1: only where it falls, going that way.
-void sim_break_changes(struct sim_breaks *breaks, const double *value, const double *lower, const double *upper,
-                       int direction, double from, double step);
+void sim_break_changes(struct sim_breaks *breaks, const double *value, const double *lower,
+                       const double *upper, int direction, double from, double step);
 
 // Places, over columns evenly from -half to half, between which a value (every stride-th) is not below 0.
 // Returns 0 if there are none.
