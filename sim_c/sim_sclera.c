@@ -298,6 +298,25 @@ static void survey(struct sweep *sweep, double *open, double *full) {
     }
 }
 
+// Where the face's shadow from a site crosses a row: its middle, and breaks around it.
+static void break_at_shadow(const struct sim_scene *scene, int site, double alpha, double lower, double step,
+                            struct sim_breaks *breaks) {
+    double before = sim_face_eye_reach(&scene->face, site, alpha, lower);
+    for (int p = 1; p < SIM_SAMPLES; ++p) {
+        double from = lower + step * (p - 1), to = from + step;
+        double after = sim_face_eye_reach(&scene->face, site, alpha, to);
+        int falls = before > 0.5, changes = falls != (after > 0.5);
+        before = after;
+        if (!changes) continue;
+        for (int i = 0; i < 5; ++i) {
+            double middle = (from + to) / 2;
+            if ((sim_face_eye_reach(&scene->face, site, alpha, middle) > 0.5) == falls) from = middle;
+            else to = middle;
+        }
+        for (int i = -1; i <= 1; ++i) sim_break_add(breaks, (from + to) / 2 + 0.03 * i, 0.005);
+    }
+}
+
 static void add_row(struct sweep *sweep, double alpha, double weight) {
     const struct sim_scene *scene = sweep->scene;
     const struct sim_eye *eye = &scene->eye;
@@ -319,6 +338,8 @@ static void add_row(struct sweep *sweep, double alpha, double weight) {
         edge_to = fmin(edge_to, lower + step * sim_crossing(column.full_upper, SIM_SAMPLES - 1, -1));
         sim_break_changes(&breaks, column.graze, column.lower, column.upper, 0, lower, step);
         sim_break_changes(&breaks, column.hide, column.lower, column.upper, 0, lower, step);
+        int site = (int)(sweep->light->order[k] - scene->sites);
+        if (!scene->face.eye_clear[site]) break_at_shadow(scene, site, alpha, lower, step, &breaks);
         // A site that sets goes behind the far margin once more.
         sim_break_changes(&breaks, column.lower, column.lower, column.upper, 1, lower, step);
         sim_break_changes(&breaks, column.full_lower, column.lower, column.upper, 1, lower, step);
