@@ -292,6 +292,10 @@ static void survey(struct sweep *sweep, double *open, double *full) {
         for (int k = 0; k < scene->n_sites; ++k) {
             look(sweep->light->order[k], &sweep->lid, scene->eye.radius, sweep->bulge, &sweep->probe,
                  &column);
+            for (int p = 0; p < SIM_SAMPLES; ++p) {
+                column.lower[p] = fmin(column.lower[p], column.hide[p]);
+                column.full_lower[p] = fmin(column.full_lower[p], column.graze[p]);
+            }
             *open++ = sim_most_of_both(column.lower, column.upper);
             *full++ = sim_most_of_both(column.full_lower, column.full_upper);
         }
