@@ -24,7 +24,8 @@ SLOW = ("sclera", "iris")
 # independent errors do: sqrt(4 * 0.35^2 + 2 * 0.4^2) = 0.9.
 SHARE, SHARE_BETWEEN = 0.35, 0.4
 SAFETY = 4.0
-PEAK = 10.0  # an error at one gaze may be this many times the tolerance
+PEAK = 6.0  # an error at one gaze may be this many times the tolerance; terms add up
+AUDIT_PEAK = 9.0  # a term found further off than this afterwards is made again, finer
 FIRST_NODES, MOST_NODES = 13, 193
 NEGLIGIBLE = 0.01  # part of the tolerance below which a term of a port is not computed at all
 HARDEST = 4  # gazes, of those where an interpolation is likeliest to be wrong, that are checked
@@ -73,11 +74,11 @@ class Making:
         with ThreadPoolExecutor(self._workers) as self._pool:
             self._plan()
             parts, wanted = {}, TERMS
-            for _ in range(ROUNDS):
+            for left in reversed(range(ROUNDS)):
                 for term in wanted:
                     parts[term] = self._term(term)
                 wanted = self._audit(parts)
-                if not wanted:
+                if not wanted or not left:
                     break
                 self._refine(wanted)
         for term in SLOW:
@@ -319,7 +320,7 @@ class Making:
     def _audit(self, parts):
         """Compare the map with everything twice as fine where it is likeliest to be wrong: where it bends
         most, and where half the fineness gives something else, on a lattice. Returns the terms whose error at
-        a gaze is more than PEAK tolerances.
+        a gaze is more than AUDIT_PEAK tolerances.
         """
         terms = [t for t in TERMS[1:] if all(len(ports) for ports in self._chosen.get(t, [[0]]))]
         chosen, roughness = set(), {}
@@ -337,7 +338,7 @@ class Making:
         for k, term in enumerate(terms):
             error = np.array([np.abs(v - parts[term][at]) for v, at in zip(values[:, k], chosen)])
             error = error.reshape((-1,) + self.pairs)
-            if error.size and error.max() > PEAK * self.tol * self.mean:
+            if error.size and error.max() > AUDIT_PEAK * self.tol * self.mean:
                 bad.append(term)
             self._keep(term, error, parts[term].max((0, 1, 2)))
             # The rms over the map, if errors are as the map bends.

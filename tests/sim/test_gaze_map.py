@@ -78,7 +78,7 @@ def test_an_impossible_argument_is_refused_with_a_remedy(led2gaze, wrong):
 
 
 def error_of(made, headset, person, gazes=8, seed=1):
-    """Errors [gaze, term, sensor, emitter] against much finer integration, and the states that they are at."""
+    """Errors [gaze, term, sensor, emitter] against much finer integration, and the states they are at."""
     rng, errors, states = np.random.default_rng(seed), [], []
     scene = Scene(headset, person, made.slip_mm[0], MUCH_FINER)
     for k in range(gazes):
@@ -119,7 +119,7 @@ def test_the_default_tolerance_is_met_on_the_default_headset(led2gaze):
     errors, states = error_of(made, led2gaze, Person(), gazes=24)
     total = errors.sum(1)
     assert np.sqrt((total[:, OFF_DIAGONAL] ** 2).mean()) < 1e-4 * made.mean
-    assert np.abs(total).max() < 1e-3 * made.mean
+    assert np.abs(total[:, OFF_DIAGONAL]).max() < 1e-3 * made.mean
     assert (np.abs(total) <= made.error_estimate[states]).all()
     assert made.estimate_rms["total"] < 1.5e-4
 
