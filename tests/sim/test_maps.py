@@ -71,8 +71,8 @@ def test_between_the_nodes_an_open_eye_is_right_to_a_ten_thousandth(led2gaze, op
 
 
 def test_glints_of_points_on_a_smooth_tear_film_get_nodes_as_close_as_they_need(led2gaze, tmp_path):
-    person, headset = replace(Person(), roughness=0.008), sharp(led2gaze)
-    assert glint_step_deg(headset, person) < 0.5 * glint_step_deg(led2gaze, Person())
+    person, headset = replace(draw_person(2), roughness=0.008), sharp(led2gaze)
+    assert glint_step_deg(headset, person) < 0.5 * glint_step_deg(led2gaze, draw_person(2))
     grid = Grid(**dict(OPEN, half_angle_deg=10.0, smooth_nodes=13, pupil_mm=(3.0, 3.5, 4.0)))
     with ResponseMap(response_map(headset, person, cache=str(tmp_path), grid=grid)) as opened:
         assert len(opened.axis(3, "azimuth_deg")) > 2 * 10.0 / 0.3
