@@ -140,7 +140,7 @@ static void add_arcs(const struct sim_lobe *lobe, const struct sim_ring *ring, d
     double arcs[ARCS][2];
     int n = arcs_seen(lobe, ring, arcs);
     for (int i = 0; i < n; ++i) {
-        double width = arcs[i][1] - arcs[i][0], widths = width / step;
+        double width = arcs[i][1] - arcs[i][0], widths = 1.4 * width / step;
         int panels = (int)ceil(widths / 5), points = panel_points(scene, widths / panels);
         const double *x = scene->rule[points], *w = x + points;
         for (int j = 0; j < panels * points; ++j) {
@@ -184,7 +184,7 @@ static void add_ring(struct sim_lobe *lobe, double theta, double weight) {
     weight *= ring.area;
     // Round the axis the lobe lies across the ring, and the slope is nowhere steep but turns.
     int axial = at->pace < 6 * reach;
-    double width = lobe->alpha / (at->pace + axial * fabs(at->miss) + 1e-9), most = 0.6 / (ring.r + 1e-9);
+    double width = lobe->alpha / (at->pace + axial * fabs(at->miss) + 1e-9), most = 0.5 / (ring.r + 1e-9);
     if (width > most) width = most;
     double sine = sqrt(fmax(0, 1 - at->cosine * at->cosine));
     if (at->cosine < 2 * reach * sine) {
@@ -230,7 +230,7 @@ static void add_panels(struct sim_lobe *lobe, double from, double to, double ste
     double widths = (to - from) * steepest / lobe->alpha, length = (to - from) * scene->eye.apex;
     int panels = (int)ceil(fmax(widths / 12, length / 4));
     if (panels < 1) panels = 1;
-    int points = panel_points(scene, fmax(widths, length / 0.6) / panels);
+    int points = panel_points(scene, fmax(widths, length / 0.5) / panels);
     const double *x = scene->rule[points], *w = x + points;
     double half = (to - from) / (2 * panels);
     for (int j = 0; j < panels * points; ++j)
@@ -239,8 +239,12 @@ static void add_panels(struct sim_lobe *lobe, double from, double to, double ste
 
 static void add_stretch(struct sim_lobe *lobe, const struct sim_stretch *stretch) {
     double reach = sqrt(lobe->cut) * lobe->alpha, from = stretch->from;
-    // A lobe too narrow to reach any horizon but in grazing light: no arc opens or closes in it that matters.
-    int pieces = reach > 0.3 ? (int)ceil((stretch->to - stretch->from) / 0.04) : 0;
+    // Only a wide lobe or grazing light reaches a horizon: else no arc opens or closes in it that matters.
+    struct sim_ring ring;
+    sim_ring_at(&lobe->gaze->scene->eye, (stretch->from + stretch->to) / 2, &ring);
+    sim_ring_face(&ring, lobe->a, lobe->b, lobe->near, &lobe->start);
+    int wide = reach > 0.3 || lobe->start.cosine < 0.3 + 2 * reach;
+    int pieces = wide ? (int)ceil((stretch->to - stretch->from) / 0.04) : 0;
     for (int i = 0; i < pieces; ++i) {
         double lo = stretch->from + (stretch->to - stretch->from) * i / pieces;
         double hi = stretch->from + (stretch->to - stretch->from) * (i + 1) / pieces;

@@ -123,7 +123,8 @@ int sim_lobe_by_mirror(struct sim_lobe *lobe, const struct sim_stretch *stretche
             steepest * (to - from) > 3.2 * reach)
             return 0;
         struct sim_facing facing = lobe->start;
-        middle = sim_mirror_root(&scene->eye, lobe->a, lobe->b, from, to, 1e-3 * lobe->alpha, &facing, &slope);
+        middle = sim_mirror_root(&scene->eye, lobe->a, lobe->b, from, to, 1e-3 * lobe->alpha, &facing,
+                                 &slope);
         // The curvature has kinks where the limbus' blend begins, is centred and ends: they must be far off.
         for (int j = i + 1; j < next; ++j)
             if (fabs(stretches[j].from - middle) * fabs(slope) < 4 * lobe->alpha) return 0;

@@ -104,7 +104,9 @@ void sim_ring_face(const struct sim_ring *ring, const double a[3], const double 
             pace2 = dm * dm + dt * dt;
             pace = sqrt(pace2);
             if (pace2 > 1e-24) x = -(sm * dm + st * dt) / pace2;
-            facing->miss = (st * dm - sm * dt) / (pace + 1e-300);
+            // Sites exactly on the axis: the same slope all around.
+            if (pace2 > 1e-24) facing->miss = (st * dm - sm * dt) / pace;
+            else facing->miss = copysign(sqrt(sm * sm + st * st), sm);
         } else {  // as good as infinitely far off
             facing->miss = hm > 0 ? 1e3 : -1e3;
         }
@@ -298,7 +300,8 @@ static double least_between(const struct scan *scan, double lo, double hi, struc
     return (lo + hi) / 2;
 }
 
-double sim_mirror_root(const struct sim_eye *eye, const double a[3], const double b[3], double from, double to,
+double sim_mirror_root(const struct sim_eye *eye, const double a[3], const double b[3], double from,
+                       double to,
                        double tolerance, struct sim_facing *facing, double *slope) {
     struct scan scan = {.eye = eye, .a = a, .b = b, .tolerance = 3 * tolerance};
     double at_from = miss_at(&scan, from, facing), at_to = miss_at(&scan, to, facing), mid = from;

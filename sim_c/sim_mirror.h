@@ -6,7 +6,8 @@
 // Slope     of the half vector h = l + v of the unit vectors to two sites, against the unit normal n: its
 //           tangential part over n.h. A mirror point has slope 0; Beckmann's lobe is exp(-slope^2 / alpha^2).
 // Miss      each ring has one azimuth where the slope is least; that slope, positive when h leans further out
-//           than n, is the ring's miss. It starts positive on the axis and ends negative behind, so its roots,
+//           than n, is the ring's miss. It starts positive on the axis and ends negative behind, so its
+// roots,
 //           the mirror points, are odd in number; where it only touches zero is the fold at the limbus.
 #ifndef SIM_MIRROR_H
 #define SIM_MIRROR_H
@@ -43,7 +44,8 @@ struct sim_facing {
 struct sim_mirror {
     double theta, point[3], normal[3];
     double distance_a, distance_b, cosine;  // of incidence
-    double determinant;  // of the second derivatives of |a - p| + |p - b| in the tangent plane, 1/mm^2: < 0 at
+    // of the second derivatives of |a - p| + |p - b| in the tangent plane, 1/mm^2: < 0 at
+    double determinant;
                          // a saddle
 };
 
@@ -72,9 +74,11 @@ void sim_facing_start(const double a[3], const double b[3], struct sim_facing *f
 int sim_profile_scan(const struct sim_profile *profile, const struct sim_eye *eye, const double a[3],
                      const double b[3], double reach, struct sim_stretch *out);
 
-// The root of the miss between two thetas of opposite sign, to a tolerance of the miss; facing is where to start
+// The root of the miss between two thetas of opposite sign, to a tolerance of the miss; facing is where to
+// start
 // and receives its azimuth, slope d miss / d theta.
-double sim_mirror_root(const struct sim_eye *eye, const double a[3], const double b[3], double from, double to,
+double sim_mirror_root(const struct sim_eye *eye, const double a[3], const double b[3], double from,
+                       double to,
                        double tolerance, struct sim_facing *facing, double *slope);
 
 // All mirror points, from the axis outward; at most `most`. Returns their number: odd, and one more of them

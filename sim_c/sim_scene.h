@@ -13,7 +13,8 @@
 //           One reflection only; skin, sclera and iris Lambertian; pupil black; the eye's front has a
 //           Beckmann glint whose width is the tear film's roughness and both lenses' radii (a disc of radius
 //           r at distance d widens the lobe of half vectors by r / (2 d)).
-// Left out  interreflection, the lashes' own light, the pupil's retro-reflection, the pupil's decentration, posterior cornea
+// Left out  interreflection, the lashes' own light, the pupil's retro-reflection, the pupil's
+// decentration, posterior cornea
 // and lens.
 #ifndef SIM_SCENE_H
 #define SIM_SCENE_H
@@ -100,19 +101,23 @@ struct sim_mirror_light {
     double point_mm[3];   // head frame
     double theta_deg;     // its direction from the centre of rotation, off the optical axis
     double sensor_mm, emitter_mm, cosine;  // both distances; cosine of incidence
-    double determinant;   // of the path length's second derivatives in the tangent plane, 1/mm^2; < 0 a saddle
+    // of the path length's second derivatives in the tangent plane, 1/mm^2; < 0 a saddle
+    double determinant;
     double response;      // of a perfectly smooth eye, both windows included, lids and face not: 1/mm^2
     double open;          // share that lids and face leave
 };
 
-// The mirror points of one pair, as if the eye were perfectly smooth and both lenses were points: all of them,
+// The mirror points of one pair, as if the eye were perfectly smooth and both lenses were points: all of
+// them,
 // from the optical axis outward. Their number is odd and one more of them have a positive determinant than a
 // negative one, whatever the gaze: a self-test. out has room for most. Returns their number or -1.
 int sim_scene_mirrors(const struct sim_scene *scene, double azimuth_deg, double elevation_deg,
                       double lid_opening, int sensor, int emitter, struct sim_mirror_light *out, int most);
 
-// How many lobes (a pair of places at one gaze) sim_scene_glint() has treated since the scene was opened: [0] by
-// the mirror point and its neighbours because of quality.tolerance, [1] by the full quadrature, [2] not at all,
+// How many lobes (a pair of places at one gaze) sim_scene_glint() has treated since the scene was opened:
+// [0] by
+// the mirror point and its neighbours because of quality.tolerance, [1] by the full quadrature, [2] not at
+// all,
 // nothing of the lobe being in view.
 void sim_scene_glint_counts(const struct sim_scene *scene, long long counts[3]);
 
