@@ -96,8 +96,8 @@ def _curves(axis, report):
         ylabel="rms error (of the mean response)",
     )
     axis.grid(alpha=0.25)
-    axis.legend(fontsize=8, loc="lower right")
-    axis.set_ylim(bottom=min(row["rms"] for rows in curves.values() for row in rows) / 30)
+    axis.legend(fontsize=8, loc="lower left")
+    axis.set_ylim(bottom=min(row["rms"] for rows in curves.values() for row in rows) / 1000)
 
 
 def _scenes(axis, report):
@@ -126,7 +126,7 @@ def _scenes(axis, report):
     axis.axvline(1e-3, color=GREY, ls=":", lw=1)
     bounded = sum(row["estimate_bounds"] for row in rows)
     axis.set(
-        title="Error against adaptive cubature; bounded by our estimate in %d of %d" % (bounded, len(rows)),
+        title="Error against adaptive cubature; within our bound: %d of %d" % (bounded, len(rows)),
         xscale="log",
         xlabel="error (of the mean total response); bars: rms 1e-4, largest 1e-3",
         yticks=y,
@@ -240,9 +240,9 @@ def _bars(axis, report):
         colour = GREEN if row["met"] else (RED if row["kind"] == "bar" else GOLD)
         words = "met" if row["met"] else ("MISSED" if row["kind"] == "bar" else "short of")
         axis.text(0.0, y, row["name"], fontsize=9, transform=axis.transAxes)
-        axis.text(0.72, y, "%.3g" % row["value"], fontsize=9, ha="right", transform=axis.transAxes)
+        axis.text(0.64, y, "%.3g" % row["value"], fontsize=9, ha="right", transform=axis.transAxes)
         axis.text(
-            0.74, y, "%s %s" % (row["kind"], row["limit"]), fontsize=9, color=GREY, transform=axis.transAxes
+            0.66, y, "%s %s" % (row["kind"], row["limit"]), fontsize=9, color=GREY, transform=axis.transAxes
         )
         axis.text(
             1.0, y, words, fontsize=9, ha="right", color=colour, weight="bold", transform=axis.transAxes
