@@ -51,7 +51,7 @@ build/native/core: $(wildcard firmware/core/*.[ch] $(SDK)/_core_b*.[pc]*) .venv/
 	@mkdir -p $(dir $@)
 	@$(call quietly,$(PY) $(SDK)/_core_build.py) && rm -f $(SDK)/_core.abi3.so && touch $@
 
-build/native/sim: $(wildcard sim_c/*.[ch] $(SDK)/_sim_build.py) .venv/setup-stamp
+build/native/sim: $(wildcard sim_c/*.[ch] sim_c/*.glsl $(SDK)/_sim_build.py) .venv/setup-stamp
 	@mkdir -p $(dir $@)
 	@$(call quietly,$(PY) $(SDK)/_sim_build.py) && touch $@
 

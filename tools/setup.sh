@@ -40,7 +40,7 @@ missing_packages() {
         [ -e "$optiboot" ] || echo arduino-core-avr            # virtual Nano: the stock bootloaders
     else
         command -v avrdude >/dev/null || echo avrdude          # a test flashes with it too
-        has_library libOSMesa.so || echo libosmesa6            # view --renderer osmesa
+        has_library libOSMesa.so || echo libosmesa6            # view --renderer osmesa, and its tests
     fi
 }
 

@@ -60,9 +60,11 @@ def test_licence_texts_are_whole(repo_root):
 USES_GPL = re.compile(
     r'#\s*include\s*["<](?:[^">]*vheadset|simavr/|sim_avr\.h|avr_ioport\.h)'
     r"|^\s*(?:from|import)\s+[\w.]*vheadset"
-    r"|dlopen\s*\(|CDLL\([^)]*(?:vheadset|simavr)|-lsimavr",
+    r"|CDLL\([^)]*(?:vheadset|simavr)|-lsimavr",
     re.MULTILINE,
 )
+# The only libraries that are opened at run time: Mesa's, under the MIT licence.
+OPENED = {"sim_c/sim_osmesa.c": {"libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"}}
 
 
 def test_nothing_includes_imports_or_links_the_virtual_nano(sources):
@@ -72,6 +74,13 @@ def test_nothing_includes_imports_or_links_the_virtual_nano(sources):
         if not path.startswith((GPL_FOLDER, "tests/build/")) and USES_GPL.search(text)
     ]
     assert users == []
+
+
+def test_only_mesa_is_opened_at_run_time(sources):
+    openers = {path for path, text in sources.items() if path.endswith((".c", ".h")) and "dlopen(" in text}
+    assert openers == set(OPENED)
+    for path, libraries in OPENED.items():
+        assert set(re.findall(r'"([^"]*\.so[.\d]*)"', sources[path])) == libraries
 
 
 @pytest.mark.parametrize(
