@@ -64,7 +64,7 @@ def study(headsets, output, persons, workers, grid, half_angle, tol, pupil, lids
     file holds response (headset, person, state, sensor, emitter, elevation, azimuth); numpy.load reads it.
 
     \b
-    Examples:
+    Example:
         sparsegaze study headsets/led2gaze.toml --persons 0-19 -o study.npz
         sparsegaze study a.toml b.toml --persons 0-4 --lids 1 --lids 0.5 --workers 8 -o both.npz --json
     """
