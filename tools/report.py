@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write README.md's result table from build/demo/report.json (made by `make demo`).
+"""Write README.md's result tables from what `make demo` and `make bench-sim` measured.
 
-    python tools/report.py             rewrite the table between the README's two markers
+    python tools/report.py             rewrite the demo's table, between its two markers
+    python tools/report.py sim         the simulator's
     python tools/report.py --check     exit 1 when the README's table is not what the report says
 """
 import argparse
@@ -40,23 +41,57 @@ def table(report):
     return "\n".join(lines)
 
 
+def figure(value):
+    """Three digits, or a whole number: as people write it."""
+    if value == int(value) and abs(value) < 1e6:
+        return f"{int(value):,}"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.2g}" if abs(value) < 1e-2 else f"{value:.3g}"
+
+
+def simulator_table(report):
+    """The Markdown table of sim.json: every bar and aim with what was measured."""
+    machine, speed, offgrid = report["machine"], report["speed"], report["offgrid"]
+    rows = [(row["name"], figure(row["value"]), f"{row['kind']} {row['limit']}", "yes" if row["met"] else "**no**")
+            for row in report["bars"]]
+    ring, map_s = report["ring"], speed["seconds"]
+    rows.append(("a response of that map, microseconds", figure(1e6 * map_s / (speed["pairs"] * speed["gazes"])), "-", "-"))
+    rows.append(("the same between the nodes of a person's map", figure(1e6 / offgrid["responses_per_second_core"] / speed["pairs"]),
+                 "-", "-"))
+    rows.append(("ring: peak over median, width; with a hard crease",
+                 f"{ring['peak_over_median']:.2f}, {ring['fwhm_deg']:.1f} deg; {ring['hard_crease_peak_over_median']:.2f}", "-", "-"))
+    lines = [f"| {machine['cores']} cores, {machine['cpu'] or 'unnamed'}, load {machine['load']:.1f} | measured | wanted | met |",
+             "|---|---|---|---|"]
+    return "\n".join(lines + [f"| {' | '.join(row)} |" for row in rows])
+
+
+SIM_BEGIN = "<!-- simulator: written by tools/report.py from build/bench/sim.json -->"
+SIM_END = "<!-- /simulator -->"
+KINDS = {
+    "demo": (Path("build/demo/report.json"), BEGIN, END, table, "make demo"),
+    "sim": (Path("build/bench/sim.json"), SIM_BEGIN, SIM_END, simulator_table, "make bench-sim"),
+}
+
+
 def main():
     """Rewrite or check the README. Returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--report", type=Path, default=Path("build/demo/report.json"))
+    parser.add_argument("kind", nargs="?", choices=KINDS, default="demo")
+    parser.add_argument("--report", type=Path, help="default: where the command that measures puts it")
     parser.add_argument("--readme", type=Path, default=Path("README.md"))
     parser.add_argument("--check", action="store_true")
     options = parser.parse_args()
-    if not options.report.is_file():
-        print(f"report: {options.report} is not there: run `make demo` first", file=sys.stderr)
+    path, begin, end, draw, command = KINDS[options.kind]
+    path = options.report or path
+    if not path.is_file():
+        print(f"report: {path} is not there: run `{command}` first", file=sys.stderr)
         return 1
     text = options.readme.read_text(encoding="utf-8")
-    head, _, rest = text.partition(BEGIN)
-    _, found, tail = rest.partition(END)
+    head, _, rest = text.partition(begin)
+    _, found, tail = rest.partition(end)
     if not found:
         print(f"report: {options.readme} lacks the markers of the result table", file=sys.stderr)
         return 1
-    wanted = f"{head}{BEGIN}\n{table(json.loads(options.report.read_text(encoding='utf-8')))}\n{END}{tail}"
+    wanted = f"{head}{begin}\n{draw(json.loads(path.read_text(encoding='utf-8')))}\n{end}{tail}"
     if options.check:
         return 0 if wanted == text else 1
     options.readme.write_text(wanted, encoding="utf-8")

@@ -49,3 +49,27 @@ def test_a_readme_without_markers_and_a_report_that_is_missing_are_errors(tool, 
     assert (tmp_path / "README.md").read_text() == "# Title\n"
     (tmp_path / "report.json").unlink()
     assert tool("--check") == 1 and "make demo" in capsys.readouterr().err
+
+
+def test_the_simulators_table_shows_every_bar_and_whether_it_was_met(monkeypatch, tmp_path):
+    figures = {
+        "machine": {"cores": 2, "cpu": "some cpu", "load": 0.5},
+        "speed": {"seconds": 1.6, "pairs": 30, "gazes": 1681},
+        "offgrid": {"responses_per_second_core": 100000.0},
+        "ring": {"peak_over_median": 2.76, "fwhm_deg": 4.4, "hard_crease_peak_over_median": 2.1},
+        "bars": [
+            {"name": "error", "value": 3.21e-05, "limit": "<= 0.0001", "met": True, "kind": "bar"},
+            {"name": "times ours", "value": 2345.6, "limit": ">= 10000", "met": False, "kind": "aim"},
+        ],
+    }
+    (tmp_path / "sim.json").write_text(json.dumps(figures))
+    readme = tmp_path / "README.md"
+    readme.write_text(f"{module.SIM_BEGIN}\n{module.SIM_END}\n{module.BEGIN}\nleft alone\n{module.END}\n")
+    files = ["--report", str(tmp_path / "sim.json"), "--readme", str(readme)]
+    monkeypatch.setattr(sys, "argv", ["report.py", "sim", *files])
+    assert module.main() == 0
+    text = readme.read_text()
+    assert "| error | 3.2e-05 | bar <= 0.0001 | yes |" in text
+    assert "| times ours | 2,346 | aim >= 10000 | **no** |" in text
+    assert "| a response of that map, microseconds | 31.7 |" in text
+    assert "left alone" in text
