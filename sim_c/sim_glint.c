@@ -15,7 +15,7 @@
 #include "sim_glint.h"
 
 #define PI 3.14159265358979323846
-enum { FEWEST = 3, ARCS = 2 };
+enum { FEWEST = 3, ARCS = 2, MOST_PANELS = 128 };
 
 double sim_gaze_window(const double aim[3], double per_tan2, const double away[3]) {
     double c = -sim_dot(aim, away);
@@ -228,7 +228,7 @@ static int arcs_kind(const struct sim_lobe *lobe, double theta) {
 static void add_panels(struct sim_lobe *lobe, double from, double to, double steepest) {
     const struct sim_scene *scene = lobe->gaze->scene;
     double widths = (to - from) * steepest / lobe->alpha, length = (to - from) * scene->eye.apex;
-    int panels = (int)ceil(fmax(widths / 12, length / 4));
+    int panels = (int)ceil(fmin(fmax(widths / 12, length / 4), MOST_PANELS));
     if (panels < 1) panels = 1;
     int points = panel_points(scene, fmax(widths, length / 0.5) / panels);
     const double *x = scene->rule[points], *w = x + points;

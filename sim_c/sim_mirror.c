@@ -172,7 +172,7 @@ static void take_cell(struct scan *scan, const struct node *lo, const struct nod
     }
     last->to = to;
     last->closed[1] = fabs(hi->miss) >= scan->reach;
-    double steep = fabs(change) / width;
+    double steep = fabs(change) / fmax(width, 1e-3 * (scan->reach + fabs(change)));  // a jump has no slope
     if (steep > last->steepest) last->steepest = steep;
     last->crossings += (lo->miss > 0) != (hi->miss > 0);
     scan->open = 1;

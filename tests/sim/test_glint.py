@@ -6,6 +6,7 @@ and each other, up to the fold at the limbus, grazing light and lobes of any wid
 
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ from brute_image import Eye, transmission, unit
 from glint_quadrature import Glint
 from sim_scenes import OFF_DIAGONAL, pair, port, six
 
-from sparsegaze.headset import Headset
-from sparsegaze.person import Person, draw_person
+from sparsegaze.headset import Headset, load_headset
+from sparsegaze.person import Person, draw_person, nominal_person
 from sparsegaze.scene import Scene, c_person, simulator
 
+HEADSET = Path(__file__).resolve().parents[2] / "headsets" / "led2gaze.toml"
 # No relief that could hide a port: what is tested here is the eye and the lids.
 FLAT_FACE = dict(brow_mm=0.0, nose_mm=0.0, cheek_mm=0.0)
 WIDE = dict(
@@ -346,3 +348,11 @@ def test_a_headset_of_many_ports_in_one_place_gets_each_its_own_glint():
         for s, e in ((0, 0), (11, 6), (5, 2)):
             alone = Scene(pair(sensors[s], emitters[e]), person).glint(3.0, 12.0, [0.5, 1.0])[:, 0, 0]
             np.testing.assert_allclose(glint[:, s, e], alone, rtol=1e-9, atol=1e-16)
+
+
+def test_a_gaze_in_the_eyes_plane_of_symmetry_returns():
+    """Azimuth -kappa puts the optical axis there: the least slope changes sides within 1e-12 of a polar
+    angle, whose steepness no panel can follow."""
+    scene = Scene(load_headset(HEADSET), nominal_person(), quality={"glint": 0.7071, "face": 0.1})
+    at, beside = scene.glint(-5.0, 1.25, 1.0)[0], scene.glint(-4.999, 1.25, 1.0)[0]
+    assert np.abs(at - beside)[[1, 2], [4, 3]].max() < 1e-3 * beside.max()
