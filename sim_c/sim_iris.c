@@ -4,7 +4,7 @@
 // batch of spots at once.
 #include <stdlib.h>
 
-#include "sim_wide.h"
+#include "sim_cornea.h"
 
 #define PI 3.14159265358979323846
 // At fineness 1: nodes of a piece of a row, mm between them; where the veil or a lid's edge is in mm per haze
@@ -12,14 +12,7 @@
 static const double NODES_ROW = 3, STEP_ROW = 1.0, STEP_VEIL = 0.4, STEP_EDGE = 0.3;
 static const double NODES_ACROSS = 3, STEP_ACROSS = 0.9;
 static const double STEP_FOCUS = 0.8;  // between points, in standard deviations of the narrowest window
-static const double SETTLED_MM = 1e-6;
 enum { NEWTON_STEPS = 6, PROBE_STEPS = 3 };
-
-struct spots {
-    int n;
-    double x[SIM_BATCH], y[SIM_BATCH], weight[SIM_BATCH];
-    double exit[3][SIM_BATCH], least[SIM_BATCH], step[SIM_BATCH];
-};
 
 struct iris {
     const struct sim_scene *scene;
@@ -28,111 +21,11 @@ struct iris {
     const struct sim_lid *lids;
     int n_lids;
     double *ring, across[2], up[2];
-    struct spots at, probe;
+    struct sim_spots at, probe;
 };
-
-// Fermat's length site - (x, y) on the cornea - spot: slopes and second derivatives, lengths of both legs.
-struct path {
-    double gx, gy, hxx, hyy, hxy, per1, per2, ux, uy, uz, vx, vy, vz, zx, zy, z;
-};
-
-SIM_INLINE struct path measure(const struct sim_eye *eye, const double site[3], double sx, double sy,
-                               double x, double y) {
-    struct path t;
-    double n = eye->index, r2 = x * x + y * y, root = sqrt(eye->radius * eye->radius - eye->p * r2);
-    double per_root = 1 / root, cube = eye->p * per_root * per_root * per_root;
-    t.z = eye->apex - r2 / (eye->radius + root);
-    t.zx = -x * per_root;
-    t.zy = -y * per_root;
-    double ux = x - site[0], uy = y - site[1], uz = t.z - site[2];
-    double vx = x - sx, vy = y - sy, vz = t.z - eye->iris_z;
-    t.per1 = 1 / sqrt(ux * ux + uy * uy + uz * uz);
-    t.per2 = 1 / sqrt(vx * vx + vy * vy + vz * vz);
-    t.ux = ux * t.per1;
-    t.uy = uy * t.per1;
-    t.uz = uz * t.per1;
-    t.vx = vx * t.per2;
-    t.vy = vy * t.per2;
-    t.vz = vz * t.per2;
-    double k1 = t.per1, k2 = n * t.per2, bend = t.uz + n * t.vz;
-    double ax = t.ux + t.uz * t.zx, ay = t.uy + t.uz * t.zy, bx = t.vx + t.vz * t.zx, by = t.vy + t.vz * t.zy;
-    t.gx = ax + n * bx;
-    t.gy = ay + n * by;
-    t.hxx = (1 + t.zx * t.zx) * (k1 + k2) - ax * ax * k1 - bx * bx * k2 - bend * (per_root + x * x * cube);
-    t.hyy = (1 + t.zy * t.zy) * (k1 + k2) - ay * ay * k1 - by * by * k2 - bend * (per_root + y * y * cube);
-    t.hxy = t.zx * t.zy * (k1 + k2) - ax * ay * k1 - bx * by * k2 - bend * x * y * cube;
-    return t;
-}
-
-// As sim_eye_refract(), a fixed number of Newton's steps from a first guess. `step` and `least` say how well
-// each has settled: what the next step would be (mm), and the Hessian's lower eigenvalue.
-SIM_WIDE static void refract(const struct sim_eye *eye, const double site[3], int steps, struct spots *s,
-                             double *transfer) {
-    int n = sim_whole(s->n);
-    double index = eye->index, per_index = 1 / index, depth = eye->apex - eye->iris_z, conic = eye->p;
-    double apex_radius = eye->radius, r_apex2 = apex_radius * apex_radius, dz = site[2] - eye->iris_z;
-    double far2 = 0.9 * eye->radius * eye->radius / (eye->p > 0.1 ? eye->p : 0.1);
-    double *x = s->exit[0], *y = s->exit[1], *z = s->exit[2];
-    SIM_EACH(p, n) {  // bend the straight way as the cornea above the spot would
-        double sx = s->x[p], sy = s->y[p], dx = site[0] - sx, dy = site[1] - sy, r2 = sx * sx + sy * sy;
-        double root = sqrt(r_apex2 - conic * r2);
-        double height = sim_wide_max(depth - r2 / (apex_radius + root), 0.1);
-        double per = 1 / sqrt(dx * dx + dy * dy + dz * dz), per_normal = 1 / sqrt(r2 + root * root);
-        double nx = sx * per_normal, ny = sy * per_normal, nz = root * per_normal;
-        double cosine = sim_wide_max((dx * nx + dy * ny + dz * nz) * per, 0.0);
-        double bend = sqrt(1 - (1 - cosine * cosine) * per_index * per_index) - cosine * per_index;
-        double along = per * per_index, rise = height / sim_wide_max(along * dz + bend * nz, 0.3);
-        x[p] = sx + (along * dx + bend * nx) * rise;
-        y[p] = sy + (along * dy + bend * ny) * rise;
-    }
-    for (int i = 0; i < steps; ++i)
-        SIM_EACH(p, n) {
-            struct path t = measure(eye, site, s->x[p], s->y[p], x[p], y[p]);
-            double per_det = 1 / (t.hxx * t.hyy - t.hxy * t.hxy);
-            double dx = (t.hxy * t.gy - t.hyy * t.gx) * per_det, dy = (t.hxy * t.gx - t.hxx * t.gy) * per_det;
-            double scale = 1 / sim_wide_max(1.0, fabs(dx) + fabs(dy));
-            double qx = x[p] + scale * dx, qy = y[p] + scale * dy;
-            double back = sqrt(far2 / sim_wide_max(far2, qx * qx + qy * qy));
-            x[p] = back * qx;
-            y[p] = back * qy;
-        }
-    SIM_EACH(p, n) {
-        struct path t = measure(eye, site, s->x[p], s->y[p], x[p], y[p]);
-        double det = t.hxx * t.hyy - t.hxy * t.hxy, middle = (t.hxx + t.hyy) / 2, half = (t.hxx - t.hyy) / 2;
-        double dx = t.hxy * t.gy - t.hyy * t.gx, dy = t.hxy * t.gx - t.hxx * t.gy;
-        s->least[p] = middle - sqrt(half * half + t.hxy * t.hxy);
-        s->step[p] = sqrt(dx * dx + dy * dy) / fabs(det);
-        z[p] = t.z;
-        double metric = 1 + t.zx * t.zx + t.zy * t.zy, per_size = 1 / sqrt(metric);
-        double cos_out = (t.zx * t.ux + t.zy * t.uy - t.uz) * per_size;
-        double cos_in = (t.vz - t.zx * t.vx - t.zy * t.vy) * per_size;
-        double c = sim_wide_max(cos_out, 0.0), inside = sqrt(1 - (1 - c * c) / (index * index));
-        double across = (c - index * inside) / (c + index * inside);
-        double along = (inside - index * c) / (inside + index * c);
-        double through = 1 - (across * across + along * along) / 2;
-        double r = sqrt(x[p] * x[p] + y[p] * y[p]);
-        double veil = 1 - sim_wide_step((r - eye->limbus) / eye->haze + 0.5);
-        double spread = index * index * c * cos_in * t.per1 * t.per1 * t.per2 * t.per2 * metric / det;
-        double light = t.vz * through * spread * veil;
-        transfer[p] = (cos_in <= 0) | (t.vz <= 0) ? 0.0 : light;
-    }
-}
-
-// The paths that did not settle, one by one.
-static void mend(const struct sim_eye *eye, const double site[3], struct spots *s, double *transfer) {
-    for (int p = 0; p < s->n; ++p) {
-        if (s->least[p] >= 0.01 && s->step[p] < SETTLED_MM) continue;
-        double spot[3] = {s->x[p], s->y[p], eye->iris_z}, exit[3];
-        double t = sim_eye_refract(eye, site, spot, exit);
-        for (int k = 0; k < 3; ++k) s->exit[k][p] = exit[k];
-        double r = sqrt(exit[0] * exit[0] + exit[1] * exit[1]);
-        transfer[p] = t > 0 ? t * (1 - sim_eye_whiteness(eye, r)) : 0;
-    }
-    for (int p = s->n; p < sim_whole(s->n); ++p) transfer[p] = 0;
-}
 
 // Where the paths cross the cornea, as the lids see it.
-SIM_WIDE static void locate(const double axes[9], const double place[3], const struct spots *s, int k,
+SIM_WIDE static void locate(const double axes[9], const double place[3], const struct sim_spots *s, int k,
                             struct sim_light *light) {
     int n = sim_whole(s->n);
     double *away = light->away + 3 * k * SIM_BATCH, *alpha = light->alpha + k * SIM_BATCH;
@@ -216,7 +109,7 @@ SIM_WIDE static void shade(const double *part, const double *open, int n, double
 static void flush(struct iris *iris) {
     const struct sim_scene *scene = iris->scene;
     struct sim_light *light = iris->light;
-    struct spots *s = &iris->at;
+    struct sim_spots *s = &iris->at;
     if (!s->n) return;
     int whole = sim_whole(s->n), ports = scene->n_sensors + scene->n_emitters;
     for (int p = s->n; p < whole; ++p) {
@@ -226,8 +119,8 @@ static void flush(struct iris *iris) {
     }
     for (int k = 0; k < scene->n_sites; ++k) {
         double *transfer = light->transfer + k * SIM_BATCH;
-        refract(&scene->eye, iris->sites[k], NEWTON_STEPS, s, transfer);
-        mend(&scene->eye, iris->sites[k], s, transfer);
+        sim_cornea_refract(&scene->eye, iris->sites[k], NEWTON_STEPS, s, transfer);
+        sim_cornea_mend(&scene->eye, iris->sites[k], s, transfer);
         locate(iris->axes, scene->sites[k].position, s, k, light);
         if (scene->face.eye_clear[k]) continue;
         const double *alpha = light->alpha + k * SIM_BATCH, *beta = light->beta + k * SIM_BATCH;
@@ -284,7 +177,7 @@ static void add_row(struct iris *iris, double radius, double u, double weight, d
     const struct sim_scene *scene = iris->scene;
     const struct sim_eye *eye = &scene->eye;
     struct sim_light *light = iris->light;
-    struct spots *probe = &iris->probe;
+    struct sim_spots *probe = &iris->probe;
     double chord = sqrt(radius * radius - u * u), step = 2 * chord / (SIM_SAMPLES - 1);
     probe_row(iris, chord, u);
     double from = chord, to = -chord, edge_from = -chord, edge_to = chord;
@@ -292,7 +185,7 @@ static void add_row(struct iris *iris, double radius, double u, double weight, d
     struct sim_breaks breaks = {2, {-chord, chord}};
     for (int i = 0; i < scene->n_sites; ++i) {
         int k = (int)(light->order[i] - scene->sites);
-        refract(eye, iris->sites[k], PROBE_STEPS, probe, light->transfer);
+        sim_cornea_refract(eye, iris->sites[k], PROBE_STEPS, probe, light->transfer);
         locate(iris->axes, scene->sites[k].position, probe, k, light);
         for (int l = 0; l < iris->n_lids; ++l) {
             look(&iris->lids[l], light, k, lower, upper, full_lower, full_upper);
@@ -355,7 +248,7 @@ static void survey(struct iris *iris, double radius, struct sim_breaks *breaks) 
             probe_row(iris, radius * cos(t), radius * sin(t));
             for (int j = 0; j < sites; ++j) {
                 int k = (int)(light->order[j] - scene->sites);
-                refract(&scene->eye, iris->sites[k], PROBE_STEPS, &iris->probe, light->transfer);
+                sim_cornea_refract(&scene->eye, iris->sites[k], PROBE_STEPS, &iris->probe, light->transfer);
                 locate(iris->axes, scene->sites[k].position, &iris->probe, k, light);
                 look(&iris->lids[l], light, k, value[0], value[1], value[2], value[3]);
                 open[i * sites + j] = sim_most_of_both(value[0], value[1]);

@@ -26,6 +26,7 @@ SOURCES = (
     "sim_diffuse.c",
     "sim_mirror.c",
     "sim_sclera.c",
+    "sim_cornea.c",
     "sim_iris.c",
     "sim_glint.c",
     "sim_glint_mirror.c",

@@ -1,0 +1,197 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Fermat's path from a site through the cornea to a spot of the iris. Over the visible side of the cornea its
+// length has one minimum, or none where the spot is out of reach; for a site beside the eye there is a saddle
+// next to it (the longer path behind the caustic), and beyond the cornea's horizon a minimum that is no path.
+// Newton's steps may slip over either. Whoever follows the minimum from refractive index 1, where it is the
+// straight line, up to the eye's, and stays where the second derivatives are positive, cannot.
+#include "sim_cornea.h"
+
+static const double SETTLED_MM = 1e-6;
+
+// Fermat's length site - (x, y) on the cornea - spot: slopes and second derivatives, lengths of both legs. n: refractive
+// index.
+struct path {
+    double gx, gy, hxx, hyy, hxy, per1, per2, ux, uy, uz, vx, vy, vz, zx, zy, z;
+};
+
+SIM_INLINE struct path measure(const struct sim_eye *eye, const double site[3], double sx, double sy,
+                               double x, double y, double n) {
+    struct path t;
+    double r2 = x * x + y * y, root = sqrt(eye->radius * eye->radius - eye->p * r2);
+    double per_root = 1 / root, cube = eye->p * per_root * per_root * per_root;
+    t.z = eye->apex - r2 / (eye->radius + root);
+    t.zx = -x * per_root;
+    t.zy = -y * per_root;
+    double ux = x - site[0], uy = y - site[1], uz = t.z - site[2];
+    double vx = x - sx, vy = y - sy, vz = t.z - eye->iris_z;
+    t.per1 = 1 / sqrt(ux * ux + uy * uy + uz * uz);
+    t.per2 = 1 / sqrt(vx * vx + vy * vy + vz * vz);
+    t.ux = ux * t.per1;
+    t.uy = uy * t.per1;
+    t.uz = uz * t.per1;
+    t.vx = vx * t.per2;
+    t.vy = vy * t.per2;
+    t.vz = vz * t.per2;
+    double k1 = t.per1, k2 = n * t.per2, bend = t.uz + n * t.vz;
+    double ax = t.ux + t.uz * t.zx, ay = t.uy + t.uz * t.zy, bx = t.vx + t.vz * t.zx, by = t.vy + t.vz * t.zy;
+    t.gx = ax + n * bx;
+    t.gy = ay + n * by;
+    t.hxx = (1 + t.zx * t.zx) * (k1 + k2) - ax * ax * k1 - bx * bx * k2 - bend * (per_root + x * x * cube);
+    t.hyy = (1 + t.zy * t.zy) * (k1 + k2) - ay * ay * k1 - by * by * k2 - bend * (per_root + y * y * cube);
+    t.hxy = t.zx * t.zy * (k1 + k2) - ax * ay * k1 - bx * by * k2 - bend * x * y * cube;
+    return t;
+}
+
+// The furthest from the axis that a crossing is looked for, squared.
+static double furthest2(const struct sim_eye *eye) {
+    return 0.95 * eye->radius * eye->radius / (eye->p > 0.1 ? eye->p : 0.1);
+}
+
+// How far a path's place is from the cornea's horizon: cosine of incidence times the normal's length.
+SIM_INLINE double facing(const struct path *t) {
+    return t->zx * t->ux + t->zy * t->uy - t->uz;
+}
+
+// Newton's steps to the minimum, as long as they stay on its side of saddle and horizon and get shorter.
+static int settle(const struct sim_eye *eye, const double site[3], const double spot[3], double index,
+                  double at[2], struct path *t) {
+    double last = 1.5, far2 = furthest2(eye);
+    for (int i = 0; i < 40; ++i) {
+        if (!(at[0] * at[0] + at[1] * at[1] < far2)) return 0;
+        *t = measure(eye, site, spot[0], spot[1], at[0], at[1], index);
+        double det = t->hxx * t->hyy - t->hxy * t->hxy;
+        if (!(det > 0 && t->hxx > 0 && facing(t) > 0)) return 0;
+        double dx = (t->hxy * t->gy - t->hyy * t->gx) / det, dy = (t->hxy * t->gx - t->hxx * t->gy) / det;
+        double step = sqrt(dx * dx + dy * dy);
+        if (step < 1e-9) return 1;
+        if (!(step < last)) return step < 1e-7;
+        last = step;
+        at[0] += dx;
+        at[1] += dy;
+    }
+    return 0;
+}
+
+// The minimum, from the straight line's crossing upward in refractive index.
+static int follow(const struct sim_eye *eye, const double site[3], const double spot[3], double at[2],
+                  struct path *t) {
+    // spot + along * d on the conic r^2 + p s^2 = 2 R s, s the depth behind the apex: a l^2 + 2 b l = c.
+    double d[3] = {site[0] - spot[0], site[1] - spot[1], site[2] - spot[2]}, s = eye->apex - spot[2];
+    double a = d[0] * d[0] + d[1] * d[1] + eye->p * d[2] * d[2];
+    double b = spot[0] * d[0] + spot[1] * d[1] + (eye->radius - eye->p * s) * d[2];
+    double c = 2 * eye->radius * s - eye->p * s * s - spot[0] * spot[0] - spot[1] * spot[1];
+    if (!(c > 0)) return 0;
+    double root = sqrt(b * b + a * c), along = b > 0 ? c / (b + root) : (root - b) / a;
+    at[0] = spot[0] + along * d[0];
+    at[1] = spot[1] + along * d[1];
+    double index = 1, rise = eye->index - 1, least = 0.01 * rise;
+    if (!settle(eye, site, spot, index, at, t)) return 0;
+    while (index < eye->index && rise > least) {
+        // The minimum moves by -1/H times what the longer second leg adds to the slope.
+        double vx = t->vx + t->vz * t->zx, vy = t->vy + t->vz * t->zy, to = fmin(index + rise, eye->index);
+        double per_det = (to - index) / (t->hxx * t->hyy - t->hxy * t->hxy);
+        double next[2] = {at[0] + (t->hxy * vy - t->hyy * vx) * per_det,
+                          at[1] + (t->hxy * vx - t->hxx * vy) * per_det};
+        struct path there;
+        if (!settle(eye, site, spot, to, next, &there)) {
+            rise /= 2;
+            continue;
+        }
+        memcpy(at, next, sizeof next);
+        *t = there;
+        index = to;
+    }
+    return index >= eye->index;
+}
+
+// A first guess: the straight way, bent as the cornea above the spot would.
+SIM_INLINE void guess(const struct sim_eye *eye, const double site[3], double sx, double sy, double *x,
+                      double *y) {
+    double per_index = 1 / eye->index, depth = eye->apex - eye->iris_z, r2 = sx * sx + sy * sy;
+    double dx = site[0] - sx, dy = site[1] - sy, dz = site[2] - eye->iris_z;
+    double root = sqrt(eye->radius * eye->radius - eye->p * r2);
+    double height = sim_wide_max(depth - r2 / (eye->radius + root), 0.1);
+    double per = 1 / sqrt(dx * dx + dy * dy + dz * dz), per_normal = 1 / sqrt(r2 + root * root);
+    double nx = sx * per_normal, ny = sy * per_normal, nz = root * per_normal;
+    double cosine = sim_wide_max((dx * nx + dy * ny + dz * nz) * per, 0.0);
+    double bend = sqrt(1 - (1 - cosine * cosine) * per_index * per_index) - cosine * per_index;
+    double along = per * per_index, rise = height / sim_wide_max(along * dz + bend * nz, 0.3);
+    *x = sx + (along * dx + bend * nx) * rise;
+    *y = sy + (along * dy + bend * ny) * rise;
+}
+
+double sim_eye_refract(const struct sim_eye *eye, const double site[3], const double spot[3],
+                       double exit[3]) {
+    struct path t;
+    double at[2], n = eye->index;
+    guess(eye, site, spot[0], spot[1], &at[0], &at[1]);
+    int found = settle(eye, site, spot, n, at, &t) || follow(eye, site, spot, at, &t);
+    double r2 = at[0] * at[0] + at[1] * at[1], far2 = furthest2(eye);
+    if (!(r2 < far2)) {
+        at[0] *= sqrt(far2 / r2);
+        at[1] *= sqrt(far2 / r2);
+        r2 = far2;
+    }
+    exit[0] = at[0];
+    exit[1] = at[1];
+    exit[2] = eye->apex - r2 / (eye->radius + sqrt(eye->radius * eye->radius - eye->p * r2));
+    if (!found) return 0;
+    double metric = 1 + t.zx * t.zx + t.zy * t.zy, size = sqrt(metric), cos_out = facing(&t) / size;
+    double cos_in = (t.vz - t.zx * t.vx - t.zy * t.vy) / size;
+    if (cos_in <= 0 || t.vz <= 0) return 0;
+    double det = (t.hxx * t.hyy - t.hxy * t.hxy) / metric;
+    double spread = n * n * cos_out * cos_in * t.per1 * t.per1 * t.per2 * t.per2 / det;
+    return t.vz * (1 - sim_fresnel(n, cos_out)) * spread;
+}
+
+SIM_WIDE void sim_cornea_refract(const struct sim_eye *eye, const double site[3], int steps,
+                                 struct sim_spots *s, double *transfer) {
+    int n = sim_whole(s->n);
+    double index = eye->index, far2 = furthest2(eye);
+    double *x = s->exit[0], *y = s->exit[1], *z = s->exit[2];
+    SIM_EACH(p, n) guess(eye, site, s->x[p], s->y[p], &x[p], &y[p]);
+    for (int i = 0; i < steps; ++i)
+        SIM_EACH(p, n) {
+            struct path t = measure(eye, site, s->x[p], s->y[p], x[p], y[p], index);
+            double per_det = 1 / (t.hxx * t.hyy - t.hxy * t.hxy);
+            double dx = (t.hxy * t.gy - t.hyy * t.gx) * per_det, dy = (t.hxy * t.gx - t.hxx * t.gy) * per_det;
+            double scale = 1 / sim_wide_max(1.0, fabs(dx) + fabs(dy));
+            double qx = x[p] + scale * dx, qy = y[p] + scale * dy;
+            double back = sqrt(far2 / sim_wide_max(far2, qx * qx + qy * qy));
+            x[p] = back * qx;
+            y[p] = back * qy;
+        }
+    SIM_EACH(p, n) {
+        struct path t = measure(eye, site, s->x[p], s->y[p], x[p], y[p], index);
+        double det = t.hxx * t.hyy - t.hxy * t.hxy, middle = (t.hxx + t.hyy) / 2, half = (t.hxx - t.hyy) / 2;
+        double dx = t.hxy * t.gy - t.hyy * t.gx, dy = t.hxy * t.gx - t.hxx * t.gy;
+        double cos_out = facing(&t), least = middle - sqrt(half * half + t.hxy * t.hxy);
+        s->least[p] = cos_out > 0 ? least : -1.0;
+        s->step[p] = sqrt(dx * dx + dy * dy) / fabs(det);
+        z[p] = t.z;
+        double metric = 1 + t.zx * t.zx + t.zy * t.zy, per_size = 1 / sqrt(metric);
+        double cos_in = (t.vz - t.zx * t.vx - t.zy * t.vy) * per_size;
+        double c = sim_wide_max(cos_out * per_size, 0.0), inside = sqrt(1 - (1 - c * c) / (index * index));
+        double across = (c - index * inside) / (c + index * inside);
+        double along = (inside - index * c) / (inside + index * c);
+        double through = 1 - (across * across + along * along) / 2;
+        double r = sqrt(x[p] * x[p] + y[p] * y[p]);
+        double veil = 1 - sim_wide_step((r - eye->limbus) / eye->haze + 0.5);
+        double spread = index * index * c * cos_in * t.per1 * t.per1 * t.per2 * t.per2 * metric / det;
+        double light = t.vz * through * spread * veil;
+        transfer[p] = (cos_in <= 0) | (t.vz <= 0) ? 0.0 : light;
+    }
+}
+
+void sim_cornea_mend(const struct sim_eye *eye, const double site[3], struct sim_spots *s, double *transfer) {
+    for (int p = 0; p < s->n; ++p) {
+        if (s->least[p] > 1e-3 && s->step[p] < SETTLED_MM) continue;
+        double spot[3] = {s->x[p], s->y[p], eye->iris_z}, exit[3];
+        double t = sim_eye_refract(eye, site, spot, exit);
+        for (int k = 0; k < 3; ++k) s->exit[k][p] = exit[k];
+        double r = sqrt(exit[0] * exit[0] + exit[1] * exit[1]);
+        transfer[p] = t > 0 ? t * (1 - sim_eye_whiteness(eye, r)) : 0;
+    }
+    for (int p = s->n; p < sim_whole(s->n); ++p) transfer[p] = 0;
+}

@@ -1,0 +1,27 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Paths of light through the cornea to spots of the iris, for a batch at once: as sim_eye_refract().
+#ifndef SIM_CORNEA_H
+#define SIM_CORNEA_H
+
+#include "sim_wide.h"
+
+// Spots on the iris' plane (eye frame), where their paths cross the cornea, and how far these have settled.
+struct sim_spots {
+    int n;
+    double x[SIM_BATCH], y[SIM_BATCH], weight[SIM_BATCH];
+    double exit[3][SIM_BATCH];
+    double least[SIM_BATCH];  // lower eigenvalue of the length's second derivatives; < 0 beyond the horizon
+    double step[SIM_BATCH];   // the next step of Newton's, mm
+};
+
+// A fixed number of Newton's steps from a first guess; transfer (veil included) is what sim_eye_refract() has
+// where that suffices.
+void sim_cornea_refract(const struct sim_eye *eye, const double site[3], int steps, struct sim_spots *spots,
+                        double *transfer);
+
+// The paths that have not settled, one by one. A spot without a path keeps a crossing, and no light.
+void sim_cornea_mend(const struct sim_eye *eye, const double site[3], struct sim_spots *spots,
+                     double *transfer);
+
+#endif
