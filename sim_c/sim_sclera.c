@@ -12,8 +12,11 @@
 // softness and haze; the same across the rows.
 static const double NODES_BETA = 2, STEP_BETA = 1.2, STEP_EDGE = 0.3, STEP_HAZE = 0.4;
 static const double NODES_ALPHA = 3, STEP_ALPHA = 0.5, STEP_ALPHA_HAZE = 0.5, STEP_ALPHA_EDGE = 0.4;
-static const double STEP_FOCUS = 0.8;  // between points, in standard deviations of a narrow window
-static const double APART = 0.02;      // least piece between two coarse breaks, radians
+static const double STEP_FOCUS = 0.4;  // between points, in standard deviations of a narrow window
+static const double APART = 0.012;     // least piece between two coarse breaks, radians
+static const double CLOSE = 0.004;     // and beside a circle of the limbus
+// Ports nearer than this to the globe, mm, want finer sums: what returns to them outshines all other pairs.
+static const double NEAR_MM = 14, FINEST = 1.8;
 
 // Points on their way: directions and weights, then places and normals, head frame.
 struct surface {
@@ -365,12 +368,13 @@ static void add_row(struct sweep *sweep, double alpha, double weight) {
     for (int i = 0; i < 3; ++i) {
         if (size <= fabs(cosine[i])) continue;
         reach_of[i] = acos(cosine[i] / size);
-        sim_break_add(&breaks, middle - reach_of[i], APART);
-        sim_break_add(&breaks, middle + reach_of[i], APART);
+        sim_break_add(&breaks, middle - reach_of[i], CLOSE);
+        sim_break_add(&breaks, middle + reach_of[i], CLOSE);
     }
     for (int i = 0; i + 1 < breaks.n; ++i) {
         double at = (breaks.at[i] + breaks.at[i + 1]) / 2, off = fabs(at - middle), step_mm = STEP_BETA;
-        if (off < reach_of[0] || at < from || at > to) continue;
+        double outermost = fmax(fabs(breaks.at[i] - middle), fabs(breaks.at[i + 1] - middle));
+        if (outermost < reach_of[0] + 1e-9 || at < from || at > to) continue;
         if (at < edge_from || at > edge_to) step_mm = STEP_EDGE * lid->softness;
         if (off < reach_of[1]) step_mm = fmin(step_mm, STEP_HAZE * eye->haze);
         add_piece(sweep, row, alpha, weight, breaks.at[i], breaks.at[i + 1], step_mm);
@@ -392,11 +396,20 @@ static void add_rows(struct sweep *sweep, double from, double to, double step_mm
         add_row(sweep, from + half * (2 * (i / n) + 1 + rule[i % n]), half * rule[n + i % n]);
 }
 
+static double fineness_for(const struct sim_scene *scene) {
+    double nearest = NEAR_MM;
+    for (int k = 0; k < scene->n_sites; ++k) {
+        const double *at = scene->sites[k].position;
+        nearest = fmin(nearest, sqrt(sim_dot(at, at)) - scene->eye.globe);
+    }
+    return scene->quality.sclera * fmin(NEAR_MM / nearest, FINEST);
+}
+
 void sim_add_sclera(const struct sim_scene *scene, struct sim_light *light, const double axes[9],
                     double elevation_deg, double opening, double *out) {
     const struct sim_eye *eye = &scene->eye;
-    struct sweep sweep = {.scene = scene, .light = light, .axes = axes, .out = out,
-                          .fineness = scene->quality.sclera};
+    struct sweep sweep = {
+        .scene = scene, .light = light, .axes = axes, .out = out, .fineness = fineness_for(scene)};
     sim_lid_pose(&sweep.lid, &scene->person, elevation_deg, opening);
     for (int k = 0; k < 3; ++k) sweep.bulge[k] = (eye->apex - eye->radius) * axes[3 * k + 2];
     double half = sweep.lid.half, ay2 = axes[5] * axes[5], middle = atan2(axes[2], -axes[8]);
