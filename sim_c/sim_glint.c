@@ -15,7 +15,7 @@
 #include "sim_glint.h"
 
 #define PI 3.14159265358979323846
-enum { FEWEST = 3, ARCS = 2, MOST_PANELS = 128 };
+enum { FEWEST = 3, ARCS = 2, MOST_PANELS = 128, MOST_STEPS = 1 << 17 };
 
 double sim_gaze_window(const double aim[3], double per_tan2, const double away[3]) {
     double c = -sim_dot(aim, away);
@@ -135,85 +135,79 @@ static int panel_points(const struct sim_scene *scene, double widths) {
     return n < FEWEST ? FEWEST : n > SIM_MAX_RULE ? SIM_MAX_RULE : n;
 }
 
+// Whether some cell of the ring covers a part of an arc, which may run past a whole turn.
+static int covered(const struct sim_lobe *lobe, double theta, double from, double to) {
+    for (int i = lobe->first; i < lobe->last; ++i) {
+        const struct sim_cell *cell = &lobe->cells[i];
+        if (cell->from > theta || cell->to <= theta) continue;
+        double off = floor(from - cell->lo);
+        for (int turn = 0; turn <= 2; ++turn)
+            if (cell->lo + off + turn <= to && cell->hi + off + turn >= from) return 1;
+    }
+    return 0;
+}
+
 static void add_arcs(const struct sim_lobe *lobe, const struct sim_ring *ring, double step, double weight) {
     const struct sim_scene *scene = lobe->gaze->scene;
     double arcs[ARCS][2];
     int n = arcs_seen(lobe, ring, arcs);
     for (int i = 0; i < n; ++i) {
-        double width = arcs[i][1] - arcs[i][0], widths = 1.4 * width / step;
-        int panels = (int)ceil(widths / 5), points = panel_points(scene, widths / panels);
+        double width = arcs[i][1] - arcs[i][0], widths = fmin(1.4 * width / step, 5.0 * MOST_PANELS * 16);
+        int panels = (int)ceil(widths / 5);
+        if (panels < 1) panels = 1;
+        int points = panel_points(scene, widths / panels);
         const double *x = scene->rule[points], *w = x + points;
-        for (int j = 0; j < panels * points; ++j) {
-            double half = width / (2 * panels);
-            double phi = arcs[i][0] + half * (2 * (j / points) + 1 + x[j % points]);
-            sim_lobe_point(lobe, ring, cos(phi), sin(phi), weight * half * w[j % points]);
-        }
-    }
-}
-
-// Adds points of equal steps from an azimuth to both sides, steps low..high; stops, if it may, where the lobe
-// is out of reach and getting further. On return low..high are the steps taken.
-static void march(const struct sim_lobe *lobe, const struct sim_ring *ring, const struct sim_facing *at,
-                  double step, int may_stop, double weight, int *low, int *high) {
-    double cs = cos(step), sn = sin(step), middle = sim_lobe_point(lobe, ring, at->c, at->s, weight);
-    for (int side = -1; side <= 1; side += 2) {
-        double c = at->c, s = at->s, before = middle;
-        int last = side < 0 ? -*low : *high;
-        for (int j = 1; j <= last; ++j) {
-            double turned = c * cs - side * s * sn;
-            s = s * cs + side * c * sn;
-            c = turned;
-            double now = sim_lobe_point(lobe, ring, c, s, weight);
-            if (may_stop && now > lobe->cut && now >= before) {
-                *(side < 0 ? low : high) = side * j;
-                break;
+        double half = width / (2 * panels);
+        for (int k = 0; k < panels; ++k) {
+            double from = arcs[i][0] + 2 * k * half;
+            if (!covered(lobe, ring->theta, from / (2 * PI), (from + 2 * half) / (2 * PI))) continue;
+            for (int j = 0; j < points; ++j) {
+                double phi = from + half * (1 + x[j]);
+                sim_lobe_point(lobe, ring, cos(phi), sin(phi), weight * half * w[j]);
             }
-            before = now;
         }
     }
 }
 
+// Adds the ring at theta: equal steps around it, of which those in cells of the cover are taken.
 static void add_ring(struct sim_lobe *lobe, double theta, double weight) {
     const struct sim_scene *scene = lobe->gaze->scene;
+    const struct sim_cell *found[SIM_COVER_CELLS];
+    double pace = 0;
+    int edge = 0, n_found = 0;
+    for (int i = lobe->first; i < lobe->last && lobe->cells[i].from <= theta; ++i) {
+        const struct sim_cell *cell = &lobe->cells[i];
+        if (cell->to <= theta) continue;
+        int j = n_found++;
+        for (; j > 0 && found[j - 1]->lo > cell->lo; --j) found[j] = found[j - 1];
+        found[j] = cell;
+        pace = fmax(pace, cell->pace);
+        edge |= cell->edge;
+    }
+    if (!n_found) return;
     struct sim_ring ring;
     sim_ring_at(&scene->eye, theta, &ring);
-    sim_ring_face(&ring, lobe->a, lobe->b, lobe->near, &lobe->start);
-    const struct sim_facing *at = &lobe->start;
-    double reach = sqrt(lobe->cut) * lobe->alpha;
-    if (fabs(at->miss) > 1.3 * reach) return;
     weight *= ring.area;
-    // Round the axis the lobe lies across the ring, and the slope is nowhere steep but turns.
-    int axial = at->pace < 6 * reach;
-    double width = lobe->alpha / (at->pace + axial * fabs(at->miss) + 1e-9), most = 0.5 / (ring.r + 1e-9);
-    if (width > most) width = most;
-    double sine = sqrt(fmax(0, 1 - at->cosine * at->cosine));
-    if (at->cosine < 2 * reach * sine) {
+    double width = fmin(lobe->alpha / pace, 0.5 / (ring.r + 1e-9));
+    if (edge) {
         add_arcs(lobe, &ring, width, weight);
         return;
     }
-    int n = (int)ceil(2 * PI / (0.9 * width) * sqrt(scene->quality.glint));
+    int n = (int)ceil(fmin(2 * PI / (0.9 * width) * sqrt(scene->quality.glint), MOST_STEPS));
     if (n < 10) n = 10;
-    double step = 2 * PI / n;
-    int low = -((n - 1) / 2), high = n / 2;
-    if (n <= 48) {
-        march(lobe, &ring, at, step, 0, weight * step, &low, &high);
-        return;
+    double step = 2 * PI / n, cs = cos(step), sn = sin(step);
+    for (int i = 0, next; i < n_found; i = next) {
+        for (next = i + 1; next < n_found && found[next]->lo == found[next - 1]->hi;) ++next;
+        int from = (int)ceil(found[i]->lo * n), to = (int)ceil(found[next - 1]->hi * n);
+        if (from == to) continue;
+        double c = cos(from * step), s = sin(from * step);
+        for (int j = from; j < to; ++j) {
+            sim_lobe_point(lobe, &ring, c, s, weight * step);
+            double turned = c * cs - s * sn;
+            s = s * cs + c * sn;
+            c = turned;
+        }
     }
-    int covered[2] = {low, high};
-    march(lobe, &ring, at, step, 1, weight * step, &covered[0], &covered[1]);
-    if (!axial) return;
-    // A second azimuth may be as near.
-    struct sim_facing other = {.c = -at->c, .s = -at->s};
-    sim_ring_face(&ring, lobe->a, lobe->b, lobe->near, &other);
-    double angle = atan2(other.s * at->c - other.c * at->s, other.c * at->c + other.s * at->s);
-    int index = (int)floor(angle / step + 0.5), from = covered[1] + 1, to = covered[0] - 1 + n;
-    if (index < covered[0]) index += n;
-    if (fabs(other.miss) > 1.3 * reach || index < from || index > to) return;
-    other.c = at->c * cos(index * step) - at->s * sin(index * step);
-    other.s = at->s * cos(index * step) + at->c * sin(index * step);
-    low = from - index;
-    high = to - index;
-    march(lobe, &ring, &other, step, 1, weight * step, &low, &high);
 }
 
 // How a ring is seen: changes where an arc appears or closes, which is where panels must end.
@@ -237,17 +231,19 @@ static void add_panels(struct sim_lobe *lobe, double from, double to, double ste
         add_ring(lobe, from + half * (2 * (j / points) + 1 + x[j % points]), half * w[j % points]);
 }
 
-static void add_stretch(struct sim_lobe *lobe, const struct sim_stretch *stretch) {
-    double reach = sqrt(lobe->cut) * lobe->alpha, from = stretch->from;
-    // Only a wide lobe or grazing light reaches a horizon: else no arc opens or closes in it that matters.
-    struct sim_ring ring;
-    sim_ring_at(&lobe->gaze->scene->eye, (stretch->from + stretch->to) / 2, &ring);
-    sim_ring_face(&ring, lobe->a, lobe->b, lobe->near, &lobe->start);
-    int wide = reach > 0.3 || lobe->start.cosine < 0.3 + 2 * reach;
-    int pieces = wide ? (int)ceil((stretch->to - stretch->from) / 0.04) : 0;
+// Adds the cells first..last of the cover, whose thetas are one interval of one piece of the profile.
+static void add_stretch(struct sim_lobe *lobe, double from, double end) {
+    double steepest = 0;
+    int edge = 0;
+    for (int i = lobe->first; i < lobe->last; ++i) {
+        steepest = fmax(steepest, lobe->cells[i].steep);
+        edge |= lobe->cells[i].edge;
+    }
+    // Only at a horizon does an arc open or close.
+    int pieces = edge ? (int)ceil((end - from) / 0.04) + 8 : 0;
+    double begin = from;
     for (int i = 0; i < pieces; ++i) {
-        double lo = stretch->from + (stretch->to - stretch->from) * i / pieces;
-        double hi = stretch->from + (stretch->to - stretch->from) * (i + 1) / pieces;
+        double lo = begin + (end - begin) * i / pieces, hi = begin + (end - begin) * (i + 1) / pieces;
         int kind = arcs_kind(lobe, lo);
         if (arcs_kind(lobe, hi) == kind) continue;
         for (int j = 0; j < 40; ++j) {
@@ -255,29 +251,49 @@ static void add_stretch(struct sim_lobe *lobe, const struct sim_stretch *stretch
             if (arcs_kind(lobe, mid) == kind) lo = mid;
             else hi = mid;
         }
-        add_panels(lobe, from, lo, stretch->steepest);
+        add_panels(lobe, from, lo, steepest);
         from = lo;
     }
-    add_panels(lobe, from, stretch->to, stretch->steepest);
+    add_panels(lobe, from, end, steepest);
+}
+
+static int by_mirror(struct sim_lobe *lobe, int n_cells, double reach) {
+    const struct sim_scene *scene = lobe->gaze->scene;
+    struct sim_stretch stretches[SIM_STRETCHES];
+    double lo = 1, hi = 0, inner = 4;
+    for (int i = 0; i < n_cells; ++i) {
+        lo = fmin(lo, lobe->cells[i].lo);
+        hi = fmax(hi, lobe->cells[i].hi);
+        inner = fmin(inner, lobe->cells[i].from);
+    }
+    // One azimuth only, and not round the axis.
+    if (inner == 0 || hi - lo > 0.3) return 0;
+    int n = sim_profile_scan(&scene->profile, &scene->eye, lobe->a, lobe->b, reach, stretches);
+    return n && sim_lobe_by_mirror(lobe, stretches, n);
 }
 
 static void add_pair(struct sim_gaze *gaze, int a, int b) {
     const struct sim_scene *scene = gaze->scene;
     double rough = scene->person.roughness, fine = log(scene->quality.glint);
+    struct sim_cell cells[SIM_COVER_CELLS];
     struct sim_lobe lobe = {.gaze = gaze, .a = gaze->sites[a], .b = gaze->sites[b], .site_a = a, .site_b = b};
+    lobe.cells = cells;
     lobe.alpha2 = rough * rough + gaze->widen[a] + gaze->widen[b];
     lobe.alpha = sqrt(lobe.alpha2);
     lobe.cut = fmin(fmax(11 + 6 * fine, 5), 30);
-    lobe.near = fmin(0.3 * lobe.alpha, 0.03);
     sim_facing_start(lobe.a, lobe.b, &lobe.start);
-    struct sim_stretch stretches[SIM_STRETCHES];
     double reach = sqrt(lobe.cut) * lobe.alpha;
-    // Of a wide lobe the linear miss is but an estimate.
-    int n = sim_profile_scan(&scene->profile, &scene->eye, lobe.a, lobe.b, reach * (1 + fmin(reach, 0.2)),
-                             stretches);
-    int cheap = n && scene->quality.tolerance > 0 && sim_lobe_by_mirror(&lobe, stretches, n);
+    int n = sim_cover(&scene->profile, &scene->eye, lobe.a, lobe.b, reach, cells);
+    int cheap = n && scene->quality.tolerance > 0 && by_mirror(&lobe, n, reach);
     ++gaze->counts[cheap ? 0 : n ? 1 : 2];
-    for (int i = 0; i < n && !cheap; ++i) add_stretch(&lobe, &stretches[i]);
+    for (int i = 0, next; i < n && !cheap; i = next) {
+        double to = cells[i].to;
+        for (next = i + 1; next < n && cells[next].piece == cells[i].piece && cells[next].from <= to; ++next)
+            to = fmax(to, cells[next].to);
+        lobe.first = i;
+        lobe.last = next;
+        add_stretch(&lobe, cells[i].from, to);
+    }
 }
 
 static int pair_used(const struct sim_scene *scene, int a, int b) {

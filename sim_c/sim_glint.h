@@ -4,6 +4,7 @@
 #ifndef SIM_GLINT_H
 #define SIM_GLINT_H
 
+#include "sim_cover.h"
 #include "sim_inside.h"
 
 // Of one gaze: all in the eye frame but the lids.
@@ -23,7 +24,8 @@ struct sim_lobe {
     const double *a, *b;
     int site_a, site_b;
     double alpha, alpha2, cut;  // cut: slope^2 / alpha^2 beyond which nothing is taken
-    double near;                // how closely a ring's centre must be found, in slope
+    const struct sim_cell *cells;  // the cover; first..last is the part in hand
+    int first, last;
     double *apart;              // [pairs of this lobe][n_lids]: where to add, instead of gaze->out; or NULL
     struct sim_facing start;
 };

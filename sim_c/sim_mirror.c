@@ -29,6 +29,37 @@ static double gap_at(const struct sim_eye *eye, double theta) {
     return sim_eye_rho(&bare, sin(theta), cos(theta), &d) - eye->globe;
 }
 
+static void measure_band(const struct sim_eye *eye, struct sim_band *band, double from, double to) {
+    enum { STEPS = 24 };
+    band->from = from;
+    band->to = to;
+    band->rate = band->along = 0;
+    band->half = -1;
+    struct sim_ring ring, last;
+    for (int i = 0; i <= STEPS; ++i) {
+        sim_ring_at(eye, from + (to - from) * i / STEPS, &ring);
+        double cross = i ? last.n_up * ring.n_out - last.n_out * ring.n_up : 0;
+        band->rate = fmax(band->rate, fabs(cross) * STEPS / (to - from));
+        band->along = fmax(band->along, ring.along);
+        last = ring;
+    }
+    band->rate = 1.06 * band->rate + 0.02;
+    band->along *= 1.02;
+    sim_ring_at(eye, (from + to) / 2, &band->ring);
+}
+
+// Halves of the longest bands first, as far as there is room.
+static void add_bands(struct sim_profile *profile, const struct sim_eye *eye) {
+    for (int i = 0; i < profile->n_bands; ++i) {
+        struct sim_band *band = &profile->bands[i];
+        double mid = (band->from + band->to) / 2;
+        if ((band->to - band->from) * band->rate < 0.03 || profile->n_bands + 2 > SIM_BANDS) continue;
+        band->half = profile->n_bands;
+        measure_band(eye, &profile->bands[profile->n_bands++], band->from, mid);
+        measure_band(eye, &profile->bands[profile->n_bands++], mid, band->to);
+    }
+}
+
 void sim_profile_init(struct sim_profile *profile, const struct sim_eye *eye) {
     double ends[SIM_PROFILE_PIECES + 1];
     int n = 0, steps = 420;
@@ -54,7 +85,9 @@ void sim_profile_init(struct sim_profile *profile, const struct sim_eye *eye) {
         }
     }
     ends[n] = THETA_END;
-    profile->n_pieces = n;
+    profile->n_pieces = profile->n_bands = n;
+    for (int p = 0; p < n; ++p) measure_band(eye, &profile->bands[p], ends[p], ends[p + 1]);
+    add_bands(profile, eye);
     profile->n_rings = 0;
     for (int p = 0; p < n; ++p) {
         profile->first[p] = profile->n_rings;

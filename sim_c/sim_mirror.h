@@ -14,12 +14,20 @@
 
 #include "sim_eye.h"
 
-enum { SIM_PROFILE_RINGS = 128, SIM_PROFILE_PIECES = 16, SIM_STRETCHES = 64 };
+enum { SIM_PROFILE_RINGS = 128, SIM_PROFILE_PIECES = 16, SIM_STRETCHES = 64, SIM_BANDS = 512 };
 
 struct sim_ring {
     double theta, r, z;   // polar angle; the ring's radius and height
     double n_out, n_up;   // unit normal: away from the axis, along it
     double along, area;   // arc length along the profile per d theta; area per d theta d phi
+};
+
+// Part of a piece of the profile.
+struct sim_band {
+    double from, to;       // theta
+    struct sim_ring ring;  // in the middle
+    double rate, along;    // bounds: |d angle of the normal / d theta|; arc length per d theta
+    int half;              // index of its first half, the second follows; -1 for none
 };
 
 // The profile's analytic pieces, which end where the limbus' blend begins, is centred and ends, and rings in
@@ -29,6 +37,8 @@ struct sim_profile {
     int first[SIM_PROFILE_PIECES + 1];  // ring that starts each piece; a piece has its own ring at both ends
     int convex[SIM_PROFILE_PIECES];     // along it; the miss only falls there, as h turns against n
     struct sim_ring rings[SIM_PROFILE_RINGS];
+    int n_bands;  // the first n_pieces of them are the pieces
+    struct sim_band bands[SIM_BANDS];
 };
 
 // Where a ring comes nearest to mirroring one site into the other.

@@ -25,6 +25,7 @@ SOURCES = (
     "sim_opening.c",
     "sim_diffuse.c",
     "sim_mirror.c",
+    "sim_cover.c",
     "sim_sclera.c",
     "sim_cornea.c",
     "sim_iris.c",
