@@ -75,6 +75,10 @@ double sim_relief_slope(const struct sim_relief *f, double x, double y, double s
     return (a > b ? a : b) + (h > 0 ? h * h * h * BLEND / 6 : 0);
 }
 
+double sim_relief_on_lids(const struct sim_relief *relief, double rho) {
+    return 1 - sim_step((rho - (relief->radius + 1)) / 1.5);
+}
+
 // No less than the highest point of a part over a rectangle.
 static double highest(const struct sim_relief *f, enum sim_part part, double x0, double x1, double y0,
                       double y1) {

@@ -3,8 +3,9 @@
 // Face and closed lids as one height field w(x, y) = -z over the frontal plane (mm, head frame, origin at the
 // centre of rotation): the lids' bulge, orbit, brow, nose and cheek, smooth everywhere and defined for all x
 // and y. Its skin is the rectangle SIM_SKIN_*; what an open eye cuts out of it is a soft mask that depends on
-// the lids' pose. What the face hides is soft as well, because a site is a lens and not a point: shadows'
-// edges are as wide as the lens makes them, so that integrals over the face are smooth in the site's
+// the lids' pose, of skin on the lids only: what stands before them in the opening's directions, as the side
+// of the nose does, stays. What the face hides is soft as well, because a site is a lens and not a point:
+// shadows' edges are as wide as the lens makes them, so that integrals over the face are smooth in the site's
 // position.
 //
 // Horizon   H (mm) of a point P for a lens centre Q: how high the centre stands above the horizon that the
@@ -52,6 +53,10 @@ void sim_relief_init(struct sim_relief *relief, const struct sim_person *person)
 double sim_relief_height(const struct sim_relief *relief, double x, double y);
 double sim_relief_slope(const struct sim_relief *relief, double x, double y, double slope[2]);
 double sim_face_height(const struct sim_person *person, double x, double y);
+
+// Share of skin at a distance from the centre of rotation that is the lids', for open lids to take away: 1 up
+// to 1 mm before their sphere, 0 from 2.5 mm on.
+double sim_relief_on_lids(const struct sim_relief *relief, double rho);
 
 // H of a point for a place.
 //   at_zero   the limit of gap(u) / u for u -> 0: sim_relief_tangent() of a point of the skin, INFINITY of a

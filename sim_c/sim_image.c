@@ -171,7 +171,7 @@ static void add_face(struct sim_image_look *look) {
         if (s->lid) {
             struct sim_lid_point at;
             sim_lid_measure(&look->lid, s->alpha, s->beta, s->rho, &at);
-            shown -= sim_lid_open(&look->lid, &at);
+            shown -= sim_relief_on_lids(&image->scene->face.relief, s->rho) * sim_lid_open(&look->lid, &at);
         }
         look->pixel = s->pixel;
         const double *light = image->skin_light + (size_t)i * (size_t)image->n_emitters;

@@ -29,6 +29,7 @@ enum { SIM_SUB = 4 };
 
 struct sim_lid_spot {
     double alpha, beta, rho;  // as the lids see it; beta out of reach where no lid can be
+    double on_lids;           // sim_relief_on_lids()
 };
 
 // About how many views of a site from a spot of the skin are worth their time, when hard shadows want more.
@@ -43,6 +44,7 @@ struct sim_skin_facts {
     int spots, lid_spots;  // evaluated for the closed lids' sum; kept for lid poses
     double lid_step_mm;    // spacing of the latter
     double tolerance;      // of one panel of the former, in units of the pairs' mean
+    double goal;           // the same before it was loosened
     unsigned char penumbra[2 * SIM_MAX_PORTS];  // whether a site's lens is partly hidden from any lit spot
 };
 

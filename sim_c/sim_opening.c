@@ -37,7 +37,7 @@ static int mask_at(const struct sim_lid *lid, const struct sim_lid_spot *spot, d
     if (spot->beta >= upper) return 0;
     if (spot->beta <= lower) return 2;
     sim_lid_measure(lid, spot->alpha, spot->beta, spot->rho, &at);
-    *open = sim_lid_open(lid, &at);
+    *open = spot->on_lids * sim_lid_open(lid, &at);
     return 1;
 }
 
@@ -97,13 +97,15 @@ static double lid_step(const struct sim_scene *scene) {
 
 // A point of the skin as the lids see it.
 static struct sim_lid_spot seen_at(const struct sim_scene *scene, double x, double y) {
-    struct sim_lid_spot seen = {0, NO_LID, 1};
+    struct sim_lid_spot seen = {0, NO_LID, 1, 0};
     struct sim_lid_point point;
     double head[3] = {x, y, -sim_relief_height(&scene->face.relief, x, y)};
     if (head[2] >= -1 || y <= SIM_SKIN_Y_FROM || y >= SIM_SKIN_Y_TO) return seen;
     seen.rho = sim_lid_locate(head, &point, &seen.alpha, &seen.beta);
     double canthus = (scene->person.canthus_deg + 4) * SIM_RADIANS;
-    if (fabs(seen.alpha) >= canthus || fabs(seen.beta) >= 65 * SIM_RADIANS) seen.beta = NO_LID;
+    seen.on_lids = sim_relief_on_lids(&scene->face.relief, seen.rho);
+    if (fabs(seen.alpha) >= canthus || fabs(seen.beta) >= 65 * SIM_RADIANS || seen.on_lids == 0)
+        seen.beta = NO_LID;
     return seen;
 }
 

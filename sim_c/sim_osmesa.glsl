@@ -323,7 +323,8 @@ float skin_light(vec3 p) {
     float light = irradiance(p, normal, away);
     vec2 mm = to_margins(p, radial, upward);
     bool may_open = abs(atan(p.x, -p.z)) < skin_canthus && abs(asin(radial.y)) < 1.134464 && -p.z > 1.0;
-    light *= may_open ? 1.0 - open_straight(mm) : 1.0;
+    float on_lids = 1.0 - soft_step((length(p) - (lid_radius + 1.0)) / 1.5);
+    light *= may_open ? 1.0 - on_lids * open_straight(mm) : 1.0;
     if (light == 0.0) return 0.0;
     return light * skin_share(p, normal, camera, camera_radius) * skin_share(p, normal, lamp, lamp_radius);
 }

@@ -8,6 +8,8 @@
 
 #define PI 3.14159265358979323846
 static const double LEAST_SIGMA_DEG = 0.5, FARTHEST_MM = 1e4, WILDEST = 1e4;
+// What sim_opening.c resolves: a spot of light's standard deviation, the width of the margins' edge.
+static const double LEAST_SPOT_MM = 0.2, LEAST_SOFTNESS_MM = 0.2;
 
 struct sim_quality sim_quality_default(void) {
     struct sim_quality q = {.sclera = 1, .iris = 1, .glint = 1, .face = 1, .tolerance = 0};
@@ -74,6 +76,8 @@ static int check_person(const struct sim_person *p, char *error, size_t bytes) {
           p->lid_close_at >= 0 && p->lid_close_at <= 1 && p->lid_thickness_mm >= 0 &&
           p->lid_softness_mm > 0 && fabs(p->lid_upper_deg) < 60 && fabs(p->lid_lower_deg) < 60))
         return refuse(error, bytes, "the lids' shape is impossible");
+    if (!(p->lid_softness_mm >= LEAST_SOFTNESS_MM))
+        return refuse(error, bytes, "the lids' softness is below 0.2 mm");
     if (!(p->lash_length_mm >= 0 && p->lash_length_mm <= 15 && p->lash_opacity >= 0 && p->lash_opacity <= 1))
         return refuse(error, bytes, "lashes are 0..15 mm long and of opacity 0..1");
     if (!(p->lid_radius_mm > p->globe_radius_mm))
@@ -99,6 +103,25 @@ static int touches(const struct sim_scene *scene, const double at[3], const stru
     return 0;
 }
 
+// How far from a place its axis meets the face with closed lids or the eye, mm; INFINITY: nowhere.
+static double first_hit(const struct sim_scene *scene, const double at[3], const double aim[3]) {
+    const double highest = 200, step = 0.1;  // of the face, mm
+    double size = sqrt(sim_dot(aim, aim)), from = 0, d[3];
+    for (int k = 0; k < 3; ++k) d[k] = aim[k] / size;
+    if (-at[2] > highest) {
+        if (d[2] <= 0) return INFINITY;
+        from = (-at[2] - highest) / d[2];
+    }
+    for (double t = from; t < from + 4 * highest; t += step) {
+        double p[3] = {at[0] + t * d[0], at[1] + t * d[1], at[2] + t * d[2]};
+        if (sim_dot(p, p) < scene->eye.apex * scene->eye.apex) return t;
+        if (p[0] < SIM_SKIN_X_FROM || p[0] > SIM_SKIN_X_TO || p[1] < SIM_SKIN_Y_FROM || p[1] > SIM_SKIN_Y_TO)
+            continue;
+        if (-p[2] <= sim_face_height(&scene->person, p[0], p[1])) return t;
+    }
+    return INFINITY;
+}
+
 static int check_port(const struct sim_scene *scene, const double at[3], const struct sim_port *port,
                       const char *what, int number, char *error, size_t bytes) {
     const struct sim_person *p = &scene->person;
@@ -118,6 +141,8 @@ static int check_port(const struct sim_scene *scene, const double at[3], const s
     else if (!(port->radius_mm < distance / 4))
         why = "has a lens too large for its distance (a quarter of it)";
     else if (touches(scene, at, port)) why = "has a lens that reaches into the eye or the face";
+    else if (first_hit(scene, at, port->aim) * tan(port->sigma_deg * SIM_RADIANS) < LEAST_SPOT_MM)
+        why = "has a spot of light narrower than 0.2 mm where it meets the face or the eye";
     if (!why) return 0;
     snprintf(text, sizeof text, "%s %d %s", what, number, why);
     return refuse(error, bytes, text);
@@ -229,6 +254,7 @@ double sim_scene_eye_reach(const struct sim_scene *scene, int emitter, int numbe
 void sim_scene_face_facts(const struct sim_scene *scene, struct sim_face_facts *facts) {
     facts->panel_spots = scene->skin_facts.spots;
     facts->panel_tolerance = scene->skin_facts.tolerance;
+    facts->panel_goal = scene->skin_facts.goal;
     facts->lid_spots = scene->skin_facts.lid_spots;
     facts->lid_step_mm = scene->skin_facts.lid_step_mm;
 }

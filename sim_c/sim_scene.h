@@ -13,9 +13,8 @@
 //           One reflection only; skin, sclera and iris Lambertian; pupil black; the eye's front has a
 //           Beckmann glint whose width is the tear film's roughness and both lenses' radii (a disc of radius
 //           r at distance d widens the lobe of half vectors by r / (2 d)).
-// Left out  interreflection, the lashes' own light, the pupil's retro-reflection, the pupil's
-// decentration, posterior cornea
-// and lens.
+// Left out  interreflection, the lashes' own light, the lids' margin between skin and eye (black), the
+//           pupil's retro-reflection, the pupil's decentration, posterior cornea and lens.
 #ifndef SIM_SCENE_H
 #define SIM_SCENE_H
 
@@ -50,9 +49,9 @@ struct sim_quality sim_quality_default(void);
 
 // Check and prepare a scene: integrates the skin, shadows and all (about 0.1 s); nothing does so later.
 //   slip_mm   added to every port's position; NULL = none.
-//   error     receives one line when the scene is impossible: a port inside the eye or the face, a number
-//             that is not
-//             finite or out of any anatomy's range.
+//   error     receives one line when the scene is impossible: a port inside the eye or the face or with a
+//             spot of light too narrow to integrate (sigma below 0.2 mm where it meets face or eye), a number
+//             that is not finite or out of any anatomy's range.
 // Returns the scene, or NULL.
 struct sim_scene *sim_scene_open(const struct sim_person *person, const struct sim_port *sensors,
                                  int n_sensors, const struct sim_port *emitters, int n_emitters,
@@ -83,6 +82,7 @@ struct sim_port_facts {
 struct sim_face_facts {
     int panel_spots, lid_spots;  // evaluated for closed lids; kept for lid poses (0 = no light on lids)
     double panel_tolerance;      // a panel's change when halved, in units of the mean response of pairs
+    double panel_goal;           // the same as it was meant to be: less where hard shadows are too many
     double lid_step_mm;          // spacing of the latter
 };
 
@@ -108,17 +108,14 @@ struct sim_mirror_light {
 };
 
 // The mirror points of one pair, as if the eye were perfectly smooth and both lenses were points: all of
-// them,
-// from the optical axis outward. Their number is odd and one more of them have a positive determinant than a
+// them, from the optical axis outward. Their number is odd and one more of them have a positive determinant than a
 // negative one, whatever the gaze: a self-test. out has room for most. Returns their number or -1.
 int sim_scene_mirrors(const struct sim_scene *scene, double azimuth_deg, double elevation_deg,
                       double lid_opening, int sensor, int emitter, struct sim_mirror_light *out, int most);
 
 // How many lobes (a pair of places at one gaze) sim_scene_glint() has treated since the scene was opened:
-// [0] by
-// the mirror point and its neighbours because of quality.tolerance, [1] by the full quadrature, [2] not at
-// all,
-// nothing of the lobe being in view.
+// [0] by the mirror point and its neighbours because of quality.tolerance, [1] by the full quadrature,
+// [2] not at all, nothing of the lobe being in view.
 void sim_scene_glint_counts(const struct sim_scene *scene, long long counts[3]);
 
 // Height of the face over the frontal plane (mm forward of the centre of rotation), for pictures and checks.

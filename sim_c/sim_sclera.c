@@ -112,8 +112,9 @@ SIM_WIDE static void place(const struct sim_eye *eye, const struct sim_lid *lid,
 }
 
 // One site: unit vectors to it and the irradiance per intensity that reaches it past lids and cornea.
-SIM_WIDE static void reach(const struct sim_scene *scene, const struct sim_site *site, const double centre[3],
-                           const struct sim_lid *lid, const struct surface *s, double *away, double *transfer) {
+SIM_WIDE static void reach(const struct sim_scene *scene, const struct sim_site *site,
+                           const double centre[3], const struct sim_lid *lid, const struct surface *s,
+                           double *away, double *transfer) {
     int n = sim_whole(s->n);
     const double *point0 = s->point[0];
     const double *point1 = s->point[1];

@@ -178,7 +178,7 @@ static double mean_of_pairs(const struct sim_scene *scene) {
 int sim_prepare_face(struct sim_scene *scene) {
     double q = scene->quality.face;
     struct work work = {.scene = scene, .pairs = scene->n_sensors * scene->n_emitters};
-    work.tolerance = PANEL_TOLERANCE / (q * q * q);
+    work.tolerance = scene->skin_facts.goal = PANEL_TOLERANCE / (q * q * q);
     scene->face_all = calloc((size_t)work.pairs, sizeof(double));
     work.panels = malloc(5 * (DEEPEST + 1) * (size_t)work.pairs * sizeof(double));
     if (scene->face_all && work.panels) {

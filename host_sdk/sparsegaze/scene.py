@@ -247,6 +247,11 @@ class Scene:
                 "face: shadows for %s have the edges of a lens of %g mm, wider than its own"
                 % (_listed(widened, kinds), width_mm)
             )
+        if face.panel_tolerance > face.panel_goal:
+            said.append(
+                "face: too many hard shadows to follow; panels agree to %.1e of the mean response each "
+                "instead of %.1e" % (face.panel_tolerance, face.panel_goal)
+            )
         if not face.lid_spots:
             said.append(
                 "lids: no light falls on skin that open lids uncover; lid poses change nothing of the face"

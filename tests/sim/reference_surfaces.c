@@ -47,12 +47,14 @@ static void add_face(void *context, double x, double y, double *out) {
     wanted_ports(scene, factor, 1e-10 * surface->brightest, wanted);
     int lid = fabs(atan2(x, -point[2])) < (w->p.canthus_deg + 4) * DEGREE &&
               fabs(asin(y / rho)) < 65 * DEGREE && point[2] < -1;
+    double on_lids = 1 - step5((rho - w->p.lid_radius_mm - 1) / 1.5);
     for (int s = 0; s < scene->n_worlds; ++s) {
         struct lid_place at;
         skin[s] = 1;
         if (!lid) continue;
         lid_measure(&scene->worlds[s], point, &at);
-        skin[s] -= step5(at.above / w->p.lid_softness_mm) * step5(at.below / w->p.lid_softness_mm);
+        skin[s] -=
+            on_lids * step5(at.above / w->p.lid_softness_mm) * step5(at.below / w->p.lid_softness_mm);
     }
     for (int k = 0; k < scene->n_ports; ++k) share[k] = -1;
     for (int k = 0; k < scene->n_ports; ++k) {

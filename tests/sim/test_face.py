@@ -160,7 +160,8 @@ def opening(person, elevation_deg, opening_, points):
     open_upper = person.lid_upper_deg + person.lid_upper_follow * elevation_deg
     open_lower = person.lid_lower_deg + person.lid_lower_follow * elevation_deg
     meet = open_lower + person.lid_close_at * (open_upper - open_lower)
-    mask = ((z < -1) & (np.abs(alpha) < half + np.radians(4)) & (np.abs(beta) < np.radians(65))).astype(float)
+    mask = 1 - smoothstep((rho - (person.lid_radius_mm + 1)) / 1.5)
+    mask *= (z < -1) & (np.abs(alpha) < half + np.radians(4)) & (np.abs(beta) < np.radians(65))
     for margin, sign in ((open_upper, 1), (open_lower, -1)):
         peak, tilt = np.radians(meet + opening_ * (margin - meet)), person.canthus_tilt_deg / 45
         curve = tilt * alpha + peak * (1 - (alpha / half) ** 2)
@@ -208,6 +209,13 @@ def face_term(person, ports, poses):
     cut = np.any(masks, 0)
     light = skin_light(person, x[cut], y[cut], ports)
     return np.array([closed - step**2 * (mask[cut] * light).sum() for mask in masks])
+
+
+def fine_face_term(person, ports, poses, box, step=0.01):
+    """By the midpoint rule over a box (x from, to, y from, to) that holds all the light."""
+    x, y = (v.ravel() for v in np.meshgrid(*(np.arange(a + step / 2, b, step) for a, b in (box[:2], box[2:]))))
+    light, points = skin_light(person, x, y, ports), skin_at(person, x, y)
+    return np.array([step**2 * (light * (1 - opening(person, e, o, points))).sum() for e, o in poses])
 
 
 QUADRATURE_CASES = {
@@ -317,6 +325,8 @@ NEAR = port((10, -10, -30))
         (replace(NEAR, sigma_deg=90.0), "sigma"),
         (replace(NEAR, sigma_deg=float("nan")), "not finite"),
         (replace(NEAR, lens_radius_mm=-1.0), "negative radius"),
+        (port((3, 2, -18.5), (0, 0, -11), 0.5), "narrower than 0.2 mm"),
+        (port((2, 20, -30), (2, 20, 0), 0.5), "narrower than 0.2 mm"),
         (replace(NEAR, lens_radius_mm=9.0), "too large"),
         (port((0, 0, -16), (0, 10, -16), lens_radius_mm=3.5), "reaches into the eye or the face"),
     ],
@@ -337,6 +347,7 @@ def test_an_impossible_port_is_refused_by_kind_number_and_reason(bad, says):
         {"nose_mm": 500.0},
         {"lid_radius_mm": 1e9},
         {"kappa_azimuth_deg": 120.0},
+        {"lid_softness_mm": 0.19},
         {"lid_upper_follow": 50.0},
         {"eye_position_mm": (0.0, 0.0, -1e7)},
     ],
@@ -357,6 +368,33 @@ def test_a_slip_that_is_no_vector_is_refused(slip):
 def test_an_unknown_quality_is_refused(quality):
     with pytest.raises(SceneError):
         Scene(pair(NEAR, NEAR), Person(), quality=quality)
+
+
+def test_the_narrowest_spot_and_margin_that_are_not_refused_are_integrated_rightly():
+    """Sigma 0.21 mm on the upper lid beside its margin, which is 0.2 mm wide."""
+    person = replace(Person(), lid_softness_mm=0.2)
+    tight = port((2.0, 6.0, -35.0), (1.5, 4.9, -12.3), 0.55, 1.0)
+    wide = port((8, -9, -28), (1, 8, -10), 12.0, 2.0)
+    poses = [(0.0, 0.0), (0.0, 1.0), (0.0, 0.9), (6.0, 1.0)]
+    scene = Scene(pair(tight, wide), person)
+    got = np.array([scene.smooth(0, e, 3.5, o, "face")[0, 0, 0, 0] for e, o in poses])
+    want = fine_face_term(person, (tight, wide), poses, (-1.0, 4.0, 2.5, 7.5))
+    assert want[0] > 1.5 * want[1] > 0 and want[2] > 1.2 * want[1]
+    np.testing.assert_allclose(got, want, atol=2e-4 * want.max())
+
+
+def test_skin_of_the_nose_in_the_openings_directions_stays():
+    """Lids 80 degrees wide reach the side of the nose; what stands 2.5 mm before them is no lid."""
+    person = replace(Person(), canthus_deg=80.0, nose_mm=16.0)
+    lens = port((-8.0, -2.0, -26.0), (-17.0, 0.0, -8.0), 8.0, 1.0)
+    scene = Scene(pair(lens, lens), person)
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(-33.95, 30, 0.1), np.arange(-20, 20, 0.1)))
+    points = skin_at(person, x, y)
+    light, mask = skin_light(person, x, y, (lens, lens)), opening(person, 0.0, 1.0, points)
+    before = np.linalg.norm(points, axis=-1) > person.lid_radius_mm + 2.5
+    assert (mask[before] == 0).all()
+    shut, wide_open = (scene.smooth(0, 0, 3.5, o, "face")[0, 0, 0, 0] for o in (0.0, 1.0))
+    assert shut - wide_open == pytest.approx(0.01 * (mask * light).sum(), abs=1e-4 * shut)
 
 
 def test_lenses_of_no_radius_are_points_and_the_limit_of_small_ones():
@@ -415,5 +453,10 @@ def test_a_scene_says_what_it_left_out(led2gaze):
     hidden = Scene(pair(replace(sensor, lens_radius_mm=0.0), emitter), draw_person(4)).left_out()
     assert any("lens of 0.25 mm" in line and "sensor 0" in line for line in hidden)
     assert not any("no penumbra" in line and "sensor 0" in line for line in hidden)
+    assert "too many hard shadows" not in usual
+    angle = np.arange(30) * 0.4
+    far = [port((450 * np.cos(a), 450 * np.sin(a), -200.0 - 8 * a), sigma_deg=60.0) for a in angle]
+    many = Headset("far points", tuple(replace(p, lens_radius_mm=0.0) for p in far), (emitter,))
+    assert any("too many hard shadows" in line for line in Scene(many, Person()).left_out())
     away = Scene(pair(port((10, -10, -30), (10, -10, -90)), emitter), Person()).left_out()
     assert any("lid poses change nothing" in line for line in away)
