@@ -5,9 +5,9 @@
 #include <string.h>
 
 #define PI 3.14159265358979323846
-static const double SMALL = 0.4;     // part of the reach over which slopes may vary in a cell
+static const double SMALL = 0.6;     // part of the reach over which slopes may vary in a cell
 static const double LARGEST = 0.2;   // radian, the same
-static const double FAST = 1e6;      // steep and pace never exceed it
+static const double FAST = 1e6;      // 1/mm, bend's bound
 enum { MOST_LEVELS = 100 };
 
 struct node {
@@ -27,9 +27,9 @@ struct search {
 
 enum verdict { DROP, KEEP, BY_THETA, BY_AZIMUTH };
 
-// Two turns or moves at right angles.
-static double together(double x, double y) {
-    return x + y > 0.5 ? x + y : 1.08 * sqrt(x * x + y * y);
+// Arc sine, from above, for 0..0.7.
+static double turned_by(double x) {
+    return x * (1 + 0.25 * x * x);
 }
 
 static enum verdict judge(const struct search *search, struct node *node) {
@@ -51,14 +51,16 @@ static enum verdict judge(const struct search *search, struct node *node) {
     }
     double size = sqrt(sim_dot(h, h)) + 1e-12;
     double tilt = node->rate * half, move = node->along * half, out = fmin(1, fabs(ring->n_out) + tilt);
-    double far = ring->r + move, turn = together(tilt, out * half_phi), moved = move + far * half_phi;
-    if (moved < 0.3 * fmin(da, db)) moved = 1.08 * sqrt(move * move + far * far * half_phi * half_phi);
+    double far = ring->r + move;
+    // Lengths of the normal's and the point's way from the middle to any place of the cell.
+    double turn = sqrt(tilt * tilt + out * out * half_phi * half_phi);
+    double moved = sqrt(move * move + far * far * half_phi * half_phi);
     // Greatest turns of the unit vectors to the sites, and of their sum.
     int near = moved > 0.7 * fmin(da, db);
-    double turn_a = near ? PI : moved / (da - moved), turn_b = near ? PI : moved / (db - moved);
+    double turn_a = near ? PI : turned_by(moved * ka), turn_b = near ? PI : turned_by(moved * kb);
     double turn_h = (turn_a + turn_b) / size, nl = sim_dot(normal, l), nv = sim_dot(normal, v);
-    int vague = near || turn_h > 0.8;
-    double spread = turn + (vague ? PI : 1.16 * turn_h), reach = search->cutoff + spread;
+    int vague = near || turn_h > 0.7;
+    double spread = turn + (vague ? PI : turned_by(turn_h)), reach = search->cutoff + spread;
     double sink_a = turn + turn_a, sink_b = turn + turn_b;
     if (nl < -sink_a || nv < -sink_b) return DROP;
     double reach2 = reach * reach;  // cosine from below
@@ -67,8 +69,8 @@ static enum verdict judge(const struct search *search, struct node *node) {
     double most = vague ? FAST : (1 / (da - moved) + 1 / (db - moved)) / (size - turn_a - turn_b + 1e-6);
     double per = (ka + kb) / size;
     if (!(most > 0 && most < 1.4 * per)) most = 1.4 * per;
-    cell->steep = fmin(node->rate + node->along * most, FAST);
-    cell->pace = fmin(out + far * most, FAST);
+    cell->bend = fmin((most + per) / 2, FAST);
+    cell->steep = node->rate + node->along * cell->bend;
     cell->edge = nl < sink_a || nv < sink_b;
     if (spread < search->small) return KEEP;
     double by_theta = (node->rate + node->along * per) * half, by_azimuth = (out + far * per) * half_phi;

@@ -13,8 +13,8 @@ enum { SIM_COVER_CELLS = 1024 };
 struct sim_cell {
     double from, to;  // theta
     double lo, hi;    // azimuth in turns, 0..1; dyadic, so that neighbours share their edges exactly
-    double steep;     // bound on the half vector's turning against the normal, radian per radian of theta
-    double pace;      // the same per radian of azimuth
+    double bend;      // about the most that the half vector turns per way along the surface, radian/mm
+    double steep;     // and against the normal, per radian of theta
     int piece;        // of the profile
     int edge;         // whether a site may set behind the eye's horizon in it
 };

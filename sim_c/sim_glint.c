@@ -173,7 +173,7 @@ static void add_arcs(const struct sim_lobe *lobe, const struct sim_ring *ring, d
 static void add_ring(struct sim_lobe *lobe, double theta, double weight) {
     const struct sim_scene *scene = lobe->gaze->scene;
     const struct sim_cell *found[SIM_COVER_CELLS];
-    double pace = 0;
+    double bend = 0;
     int edge = 0, n_found = 0;
     for (int i = lobe->first; i < lobe->last && lobe->cells[i].from <= theta; ++i) {
         const struct sim_cell *cell = &lobe->cells[i];
@@ -181,14 +181,15 @@ static void add_ring(struct sim_lobe *lobe, double theta, double weight) {
         int j = n_found++;
         for (; j > 0 && found[j - 1]->lo > cell->lo; --j) found[j] = found[j - 1];
         found[j] = cell;
-        pace = fmax(pace, cell->pace);
+        bend = fmax(bend, cell->bend);
         edge |= cell->edge;
     }
     if (!n_found) return;
     struct sim_ring ring;
     sim_ring_at(&scene->eye, theta, &ring);
     weight *= ring.area;
-    double width = fmin(lobe->alpha / pace, 0.5 / (ring.r + 1e-9));
+    double width = lobe->alpha / (fabs(ring.n_out) + ring.r * bend + 1e-9);
+    if (width > 0.33 / (ring.r + 1e-9)) width = 0.33 / (ring.r + 1e-9);
     if (edge) {
         add_arcs(lobe, &ring, width, weight);
         return;
