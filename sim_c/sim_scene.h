@@ -82,7 +82,7 @@ struct sim_port_facts {
 struct sim_face_facts {
     int panel_spots, lid_spots;  // evaluated for closed lids; kept for lid poses (0 = no light on lids)
     double panel_tolerance;      // a panel's change when halved, in units of the mean response of pairs
-    double panel_goal;           // the same as it was meant to be: less where hard shadows are too many
+    double panel_goal;           // the same as it was meant to be, before too many hard shadows loosened it
     double lid_step_mm;          // spacing of the latter
 };
 
@@ -108,8 +108,8 @@ struct sim_mirror_light {
 };
 
 // The mirror points of one pair, as if the eye were perfectly smooth and both lenses were points: all of
-// them, from the optical axis outward. Their number is odd and one more of them have a positive determinant than a
-// negative one, whatever the gaze: a self-test. out has room for most. Returns their number or -1.
+// them, from the optical axis outward. Their number is odd and one more of them have a positive determinant
+// than a negative one, whatever the gaze: a self-test. out has room for most. Returns their number or -1.
 int sim_scene_mirrors(const struct sim_scene *scene, double azimuth_deg, double elevation_deg,
                       double lid_opening, int sensor, int emitter, struct sim_mirror_light *out, int most);
 

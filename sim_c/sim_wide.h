@@ -185,6 +185,29 @@ int sim_positive(const double *value, int stride, double half, double *from, dou
 // Gauss's rule for a piece that wants so many nodes: nodes, of equal parts.
 int sim_nodes_for(double want, int *parts);
 
+// Points of the eye's surface on their way: directions and weights, then places and normals, head frame.
+struct sim_surface {
+    int n;
+    double row[2][SIM_BATCH];  // sine and cosine of alpha
+    double alpha[SIM_BATCH], beta[SIM_BATCH], weight[SIM_BATCH];
+    double point[3][SIM_BATCH], normal[3][SIM_BATCH], radial[3][SIM_BATCH], up[3][SIM_BATCH];
+    double above[SIM_BATCH], below[SIM_BATCH];
+};
+
+// Points and normals from directions; the weights become areas of white (albedo 1/sr). axes: of the eye.
+void sim_surface_place(const struct sim_eye *eye, const struct sim_lid *lid, const double axes[9],
+                       double albedo, struct sim_surface *s);
+
+// One site: unit vectors to it, away [3][SIM_BATCH], and the irradiance per intensity that reaches the points
+// past lids and cornea. centre: of the sphere that the cornea is here, head frame.
+void sim_surface_reach(const struct sim_scene *scene, const struct sim_site *site, const double centre[3],
+                       const struct sim_lid *lid, const struct sim_surface *s, double *away,
+                       double *transfer);
+
+// The same site's light through the lashes.
+void sim_surface_dim(const struct sim_lid *lid, const struct sim_surface *s, const double *away,
+                     double *transfer);
+
 // The sclera, of one lid pose: out [sensors][emitters]. axes: of the eye, as sim_eye_orient().
 void sim_add_sclera(const struct sim_scene *scene, struct sim_light *light, const double axes[9],
                     double elevation_deg, double opening, double *out);

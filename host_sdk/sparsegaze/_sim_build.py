@@ -26,6 +26,7 @@ SOURCES = (
     "sim_diffuse.c",
     "sim_mirror.c",
     "sim_cover.c",
+    "sim_surface.c",
     "sim_sclera.c",
     "sim_cornea.c",
     "sim_iris.c",
