@@ -15,7 +15,7 @@ import numpy as np
 from . import mapplan
 from .mapcall import calls
 from .mapjudge import bend, counted_pairs, hardest, mean_response, scale_of
-from .mapneed import Chosen, may_see
+from .mapneed import Chosen, hidden_eye, may_see, other_ports
 from .scene import Scene
 
 TERMS = ("face", "sclera", "iris", "glint")
@@ -47,7 +47,7 @@ class Making:
         self.azimuth, self.elevation = azimuth_deg, elevation_deg
         self.pupil, self.lid, self.slip = states
         self.pairs = (len(headset.sensors), len(headset.emitters))
-        self.errors, self.rms, self._notes = {}, {}, {}
+        self.errors, self.rms, self._notes, self._facts = {}, {}, {}, []
         self._workers, self._progress, self._base, self._shown = workers, progress, 0.0, 0.0
         self._between_share = dict.fromkeys(SLOW, SHARE_BETWEEN)
         self._scenes, self._rough = {}, set()
@@ -83,6 +83,11 @@ class Making:
                 self._refine(wanted)
         for term in SLOW:
             self.rms[term] = float(np.hypot(self.rms[term], self.rms.pop(term + " between", 0.0)))
+        dark = 100 * (parts["glint"][self.lid > 0] == 0).mean() if (self.lid > 0).any() else 0.0
+        if dark and "no glint" not in self._notes:
+            self._notes["unlit"] = (
+                "glint: 0 for %.2g %% of pairs and gazes, where nothing of its lobe is in view" % dark
+            )
         total = sum(parts.values())
         self.mean = mean_response(np.moveaxis(total, (1, 2), (3, 4)), self.azimuth, self.elevation)
         return {term: np.moveaxis(values, (1, 2), (3, 4)) for term, values in parts.items()}
@@ -151,7 +156,7 @@ class Making:
                 "%s: left out for %s, whose windows show none of it; at most %.0e of the mean"
                 % (
                     term,
-                    _of_ports(self.pairs, sensors, emitters),
+                    other_ports(self.pairs, sensors, emitters),
                     self._unseen[term].max() / self.mean,
                 )
             )
@@ -220,7 +225,10 @@ class Making:
         for kept in self.errors, self.rms:
             kept.pop(term + " between", None)
         self._notes.pop(term, None)
-        for number, slip in enumerate(slips):
+        if term == "face":  # what the engine says of itself, as far as it is so at every slip
+            facts = [self._scene(slip, term).left_out() for slip in slips]
+            self._facts = [said for said in facts[0] if all(said in others for others in facts)]
+        for slip in slips:
             members = np.flatnonzero((self.slip == slip).all(1))
             if term != "face":
                 members = members[self.lid[members] > 0]  # closed lids hide the eye: exactly nothing
@@ -320,7 +328,7 @@ class Making:
     def _audit(self, parts):
         """Compare the map with everything twice as fine where it is likeliest to be wrong: where it bends
         most, and where half the fineness gives something else, on a lattice. Returns the terms whose error at
-        a gaze is more than AUDIT_PEAK tolerances.
+        a gaze is more than AUDIT_PEAK tolerances and that can be had finer.
         """
         terms = [t for t in TERMS[1:] if all(len(ports) for ports in self._chosen.get(t, [[0]]))]
         chosen, roughness = set(), {}
@@ -338,7 +346,8 @@ class Making:
         for k, term in enumerate(terms):
             error = np.array([np.abs(v - parts[term][at]) for v, at in zip(values[:, k], chosen)])
             error = error.reshape((-1,) + self.pairs)
-            if error.size and error.max() > AUDIT_PEAK * self.tol * self.mean:
+            better = self.rung[term] < mapplan.RUNGS[term][1] or term in self._rough
+            if better and error.size and error.max() > AUDIT_PEAK * self.tol * self.mean:
                 bad.append(term)
             self._keep(term, error, parts[term].max((0, 1, 2)))
             # The rms over the map, if errors are as the map bends.
@@ -376,12 +385,11 @@ class Making:
 
     def left_out(self):
         """Sentences on what was left out or simplified, why, and what that costs."""
-        said = []
-        if (self.lid == 0).any():
-            said.append("lids closed (opening 0): sclera, iris and glint are hidden exactly; error 0")
+        said = hidden_eye(self.lid)
         if len(self.azimuth) > 1:
             said.append("face: computed once per elevation, because the lids follow elevation only; error 0")
-        for name in ("no sclera", "no iris", "no glint", "sclera", "iris", "mirror"):
+        said += self._facts
+        for name in ("no sclera", "no iris", "no glint", "sclera", "iris", "unlit", "mirror"):
             if name in self._notes:
                 said.append(self._notes[name])
         for term in TERMS:
@@ -390,15 +398,3 @@ class Making:
                 % (term, self.quality[term], self.rms[term])
             )
         return said
-
-
-def _of_ports(pairs, sensors, emitters):
-    """Words for the ports that are not among the chosen."""
-    if not len(sensors) or not len(emitters):
-        return "all pairs"
-    words = []
-    for name, count, chosen in (("sensor", pairs[0], sensors), ("emitter", pairs[1], emitters)):
-        others = [str(i) for i in range(count) if i not in chosen]
-        if others:
-            words.append("%s%s %s" % (name, "s" * (len(others) > 1), ", ".join(others)))
-    return " and ".join(words)

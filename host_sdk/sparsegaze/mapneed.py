@@ -90,6 +90,30 @@ def _reach(port, person, slip_mm, patch, apex):
     return best
 
 
+def other_ports(pairs, sensors, emitters):
+    """Words for the ports that are not among the chosen."""
+    if not len(sensors) or not len(emitters):
+        return "all pairs"
+    words = []
+    for name, count, chosen in (("sensor", pairs[0], sensors), ("emitter", pairs[1], emitters)):
+        others = [str(i) for i in range(count) if i not in chosen]
+        if others:
+            words.append("%s%s %s" % (name, "s" * (len(others) > 1), ", ".join(others)))
+    return " and ".join(words)
+
+
+def hidden_eye(lid_opening):
+    """Sentences (one or none) about the states whose lids are closed."""
+    closed = np.flatnonzero(np.asarray(lid_opening) == 0)
+    if not len(closed):
+        return []
+    where = "every state" if len(closed) == len(lid_opening) else "state " + ", ".join(map(str, closed))
+    return [
+        "lids closed in %s: all of the eye is behind them, so sclera, iris and glint are 0 and were not "
+        "computed; what is left is the face with its lids; error 0" % where
+    ]
+
+
 class Chosen:
     """A scene of some of a headset's ports, whose values have all ports' shape: nothing for the others."""
 

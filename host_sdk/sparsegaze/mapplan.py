@@ -17,7 +17,7 @@ from .scene import Scene
 STEP = 2.0**0.5  # fineness from rung to rung
 FINER = 2  # rungs between a value and what it is compared with
 START = {"sclera": 0.7, "iris": 0.35, "glint": 0.5, "face": 0.5}  # fineness of rung 0
-RUNGS = {"sclera": (-4, 4), "iris": (-2, 4), "glint": (-2, 6), "face": (-2, 5)}
+RUNGS = {"sclera": (-4, 6), "iris": (-2, 6), "glint": (-2, 6), "face": (-2, 5)}
 FACE_FALLS = 2.0  # error of a rung of the face <= its difference from the rung below / this; measured 3 to 7
 EYE_ONLY = 0.1  # fineness of the face where it is not asked for
 RMS_SAFETY = 1.5  # a dozen gazes see this much less than the map's rms, at worst

@@ -30,20 +30,37 @@ DIFFUSE = ("face", "sclera", "iris")
 
 def scenes(count, threads, say):
     """[{name, rms_total, rms_diffuse, rms_glint, max_total, estimate_bounds, seconds, ...}] of
-    random_scenes().
+    random_scenes(). A scene that cannot be made or judged has a row that says why, as wrong as no map at all.
     """
     from random_scenes import random_scenes
 
-    cases, truths = random_scenes(count), []
+    cases, rows = random_scenes(count), []
     with ProcessPoolExecutor(threads) as pool:
-        for number, truth in enumerate(pool.map(reference_of, cases)):
-            say("reference %d of %d: %s" % (number + 1, count, cases[number].name))
-            truths.append(truth)
-    rows = []
+        truths = [pool.submit(reference_of, case) for case in cases]
+        for number, (case, truth) in enumerate(zip(cases, truths)):
+            attempt(truth.result)
+            say("reference %d of %d: %s" % (number + 1, count, case.name))
     for number, (case, truth) in enumerate(zip(cases, truths)):
         say("scene %d of %d: %s" % (number + 1, count, case.name))
-        rows.append(scene_row(case, truth, threads))
+        row, why = attempt(lambda case=case, truth=truth: scene_row(case, truth.result(), threads))
+        if why:
+            say("%s failed: %s" % (case.name, why))
+        rows.append(row or failed(case, why))
     return rows
+
+
+def attempt(function):
+    """(its value, ""), or (None, why it failed)."""
+    try:
+        return function(), ""
+    except Exception as error:  # whatever it is: the other scenes are still to be judged
+        return None, "%s: %s" % (type(error).__name__, error)
+
+
+def failed(case, why):
+    """The row of a scene without a map: off by all of the mean response, and nothing bounds that."""
+    wrong = dict.fromkeys(("rms_total", "rms_diffuse", "rms_glint", "max_total"), 1.0)
+    return dict(wrong, name=case.name, estimate_bounds=False, seconds=0.0, failed=why)
 
 
 def reference_of(case):
