@@ -227,3 +227,21 @@ def test_what_the_peers_need_is_pinned_with_hashes_and_named_nowhere_else(repo_r
         assert "mitsuba" not in (repo_root / name).read_text()
     for name in ("requirements-bench.in", "requirements-bench.txt", "tools/bench/setup_bench.sh"):
         assert "://" not in (repo_root / name).read_text()
+
+
+def test_a_scene_that_fails_is_a_row_and_the_others_are_judged(bench, monkeypatch):
+    errors, said = bench["bench_errors"], []
+    real = errors.scene_row
+
+    def row(case, truth, threads):
+        if case.name == "glint on the limbus":
+            raise RuntimeError("no answer")
+        return real(case, truth, threads)
+
+    monkeypatch.setattr(errors, "scene_row", row)
+    first, second = errors.scenes(2, 1, said.append)
+    assert first["failed"] == "RuntimeError: no answer" and first["estimate_bounds"] is False
+    assert first["rms_total"] == 1.0 and second["estimate_bounds"] is True and second["rms_total"] < 1e-4
+    assert any("glint on the limbus failed" in line for line in said)
+    bars = {bar["name"]: bar["met"] for bar in bench["bench_sim"].bars({"scenes": [first, second]})}
+    assert not any(bars.values())

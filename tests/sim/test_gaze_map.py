@@ -20,14 +20,7 @@ from sparsegaze.person import Person
 from sparsegaze.scene import Scene
 
 MUCH_FINER = {"sclera": 4, "iris": 3, "glint": 6, "face": 2.8}
-JUDGED = (
-    "glint on the limbus",
-    "narrow lobe",
-    "half-closed lids",
-    "tangent sensor",
-    "eye 1 m off the origin",
-)
-JUDGED += ("sensor 500 mm away", "random 0", "random 3", "random 4")
+FINER = {"sclera": 3, "iris": 2, "glint": 4, "face": 2}  # for maps of coarser tolerances
 
 
 @pytest.fixture(scope="module")
@@ -77,10 +70,10 @@ def test_an_impossible_argument_is_refused_with_a_remedy(led2gaze, wrong):
     assert caught.value.remedy
 
 
-def error_of(made, headset, person, gazes=8, seed=1):
+def error_of(made, headset, person, gazes=8, seed=1, quality=MUCH_FINER):
     """Errors [gaze, term, sensor, emitter] against much finer integration, and the states they are at."""
     rng, errors, states = np.random.default_rng(seed), [], []
-    scene = Scene(headset, person, made.slip_mm[0], MUCH_FINER)
+    scene = Scene(headset, person, made.slip_mm[0], quality)
     for k in range(gazes):
         state = k % len(made.pupil_mm)
         row, column = rng.integers(len(made.elevation_deg)), rng.integers(len(made.azimuth_deg))
@@ -95,21 +88,24 @@ def error_of(made, headset, person, gazes=8, seed=1):
     return np.array(errors), states
 
 
-@pytest.mark.parametrize("case", [c for c in random_scenes(20) if c.name in JUDGED], ids=lambda c: c.name)
+@pytest.mark.parametrize("case", random_scenes(20), ids=lambda c: c.name)
 def test_the_estimate_bounds_the_error_on_hard_and_random_scenes(case):
+    """At a coarse tolerance, where a bound is easiest to miss. Measured: the worst error is 0.03 to 0.48 of
+    its bound, 1.3e-3 rms at most.
+    """
     made = compute_map(
         case.headset,
         case.person,
-        grid=5,
-        tol=5e-4,
+        grid=3,
+        tol=2e-3,
         pupil_mm=tuple(state[2] for state in case.states),
         lid_opening=tuple(state[3] for state in case.states),
     )
-    errors, states = error_of(made, case.headset, case.person)
+    errors, states = error_of(made, case.headset, case.person, gazes=4, quality=FINER)
     total = np.abs(errors.sum(1))
     assert (total <= made.error_estimate[states]).all()
     rms = np.sqrt((total[:, counted_pairs(total.shape[1:])] ** 2).mean()) / made.mean
-    assert rms < 5e-4
+    assert rms < 2e-3
 
 
 def test_the_default_tolerance_is_met_on_the_default_headset(led2gaze):
@@ -191,8 +187,24 @@ def test_a_port_that_sees_no_eye_is_left_out_and_said_so():
 def test_closed_lids_need_no_eye(led2gaze):
     made = compute_map(led2gaze, Person(), grid=3, tol=1e-3, lid_opening=(0.0,))
     assert not any(made.parts[term].any() for term in ("sclera", "iris", "glint"))
-    assert any("closed" in sentence for sentence in made.left_out)
+    assert any(s.startswith("lids closed in every state: all of the eye") for s in made.left_out)
     assert np.ptp(made.response, axis=-1).max() == 0
+
+
+def test_it_is_said_which_states_have_closed_lids_and_what_the_engine_left_out(led2gaze):
+    """Of what the engine says, only what is so at every slip."""
+    states = dict(lid_opening=(1.0, 0.0, 0.0), slip_mm=((0, 0, 0), (0, 0, 0), (0.5, 0, 0)))
+    said = compute_map(led2gaze, Person(), grid=3, tol=1e-2, **states).left_out
+    assert any(s.startswith("lids closed in state 1, 2: ") for s in said)
+    known = set(Scene(led2gaze, Person()).left_out()) & set(Scene(led2gaze, Person(), (0.5, 0, 0)).left_out())
+    assert known and known <= set(said)
+
+
+def test_a_hidden_glint_is_said_with_its_share(led2gaze):
+    made = compute_map(led2gaze, Person(), grid=5, tol=1e-2, lid_opening=(0.3,))
+    share = 100 * (made.parts["glint"] == 0).mean()
+    assert share > 5
+    assert any(s.startswith("glint: 0 for %.2g %% of pairs and gazes" % share) for s in made.left_out)
 
 
 @pytest.mark.parametrize("case", random_scenes(20)[::3], ids=lambda c: c.name)
