@@ -6,7 +6,7 @@
 
 #define PI 3.14159265358979323846
 static const double THETA_END = 105 * PI / 180;
-enum { MOST_HALVINGS = 40 };
+enum { MOST_HALVINGS = 40, MOST_SPLITS = 3000 };
 
 void sim_ring_at(const struct sim_eye *eye, double theta, struct sim_ring *ring) {
     double s = sin(theta), c = cos(theta), d, rho = sim_eye_rho(eye, s, c, &d);
@@ -172,6 +172,7 @@ struct scan {
     double reach, tolerance;
     struct sim_stretch *out;
     int n, open;  // stretches so far; whether the last one is in this piece
+    int splits;   // left to make: a near tangent site's miss can jump from ring to ring
 };
 
 static struct node node_at(const struct scan *scan, const struct sim_ring *ring,
@@ -222,6 +223,7 @@ static void halve(struct scan *scan, const struct node *lo, const struct node *h
         take_cell(scan, lo, hi);
         return;
     }
+    if (--scan->splits < 0) return;
     struct sim_ring ring;
     sim_ring_at(scan->eye, (lo->theta + hi->theta) / 2, &ring);
     struct node mid = node_at(scan, &ring, &lo->facing);
@@ -233,7 +235,7 @@ static void halve(struct scan *scan, const struct node *lo, const struct node *h
 
 int sim_profile_scan(const struct sim_profile *profile, const struct sim_eye *eye, const double a[3],
                      const double b[3], double reach, struct sim_stretch *out) {
-    struct scan scan = {.eye = eye, .a = a, .b = b, .out = out};
+    struct scan scan = {.eye = eye, .a = a, .b = b, .out = out, .splits = MOST_SPLITS};
     scan.reach = reach / sqrt(1 + reach * reach);
     scan.tolerance = fmin(0.1 * reach, 0.03);
     struct node nodes[SIM_PROFILE_RINGS], last;
@@ -257,7 +259,7 @@ int sim_profile_scan(const struct sim_profile *profile, const struct sim_eye *ey
             halve(&scan, &nodes[i], &nodes[i + 1], bend / (width * width), 0);
         }
     }
-    return scan.n;
+    return scan.splits < 0 ? 0 : scan.n;
 }
 
 // Miss of the ring at theta, found from a starting azimuth that is left at the ring's own.

@@ -80,13 +80,13 @@ void sim_ring_face(const struct sim_ring *ring, const double a[3], const double 
 void sim_facing_start(const double a[3], const double b[3], struct sim_facing *facing);
 
 // All stretches in which |miss| <= reach: the profile's rings first, then halved cells wherever the miss may
-// dip within reach between them. Returns their number, at most SIM_STRETCHES.
+// dip within reach between them. Returns their number, at most SIM_STRETCHES, or 0 when the search has no end
+// (a nearly tangent site's miss jumps from ring to ring).
 int sim_profile_scan(const struct sim_profile *profile, const struct sim_eye *eye, const double a[3],
                      const double b[3], double reach, struct sim_stretch *out);
 
 // The root of the miss between two thetas of opposite sign, to a tolerance of the miss; facing is where to
-// start
-// and receives its azimuth, slope d miss / d theta.
+// start and receives its azimuth, slope d miss / d theta.
 double sim_mirror_root(const struct sim_eye *eye, const double a[3], const double b[3], double from,
                        double to,
                        double tolerance, struct sim_facing *facing, double *slope);
