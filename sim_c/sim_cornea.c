@@ -9,8 +9,8 @@
 
 static const double SETTLED_MM = 1e-6;
 
-// Fermat's length site - (x, y) on the cornea - spot: slopes and second derivatives, lengths of both legs. n: refractive
-// index.
+// Fermat's length site - (x, y) on the cornea - spot: slopes and second derivatives, lengths of both legs.
+// n: refractive index.
 struct path {
     double gx, gy, hxx, hyy, hxy, per1, per2, ux, uy, uz, vx, vy, vz, zx, zy, z;
 };
@@ -106,8 +106,11 @@ static int follow(const struct sim_eye *eye, const double site[3], const double 
 }
 
 // A first guess: the straight way, bent as the cornea above the spot would.
-SIM_INLINE void guess(const struct sim_eye *eye, const double site[3], double sx, double sy, double *x,
-                      double *y) {
+struct place {
+    double x, y;
+};
+
+SIM_INLINE struct place guess(const struct sim_eye *eye, const double site[3], double sx, double sy) {
     double per_index = 1 / eye->index, depth = eye->apex - eye->iris_z, r2 = sx * sx + sy * sy;
     double dx = site[0] - sx, dy = site[1] - sy, dz = site[2] - eye->iris_z;
     double root = sqrt(eye->radius * eye->radius - eye->p * r2);
@@ -117,15 +120,41 @@ SIM_INLINE void guess(const struct sim_eye *eye, const double site[3], double sx
     double cosine = sim_wide_max((dx * nx + dy * ny + dz * nz) * per, 0.0);
     double bend = sqrt(1 - (1 - cosine * cosine) * per_index * per_index) - cosine * per_index;
     double along = per * per_index, rise = height / sim_wide_max(along * dz + bend * nz, 0.3);
-    *x = sx + (along * dx + bend * nx) * rise;
-    *y = sy + (along * dy + bend * ny) * rise;
+    struct place at = {sx + (along * dx + bend * nx) * rise, sy + (along * dy + bend * ny) * rise};
+    return at;
+}
+
+int sim_cornea_folds(const struct sim_eye *eye, const double site[3]) {
+    // The horizon lies in the site's polar plane: x (along the site's azimuth) is linear in the depth.
+    enum { PLACES = 32 };
+    double far = sqrt(site[0] * site[0] + site[1] * site[1]), deep = eye->apex - site[2], n = eye->index;
+    double rim = eye->limbus + eye->haze / 2, rim2 = rim * rim, ex = site[0] / far, ey = site[1] / far;
+    double deepest = rim2 / (eye->radius + sqrt(eye->radius * eye->radius - eye->p * rim2));
+    if (far < 1e-6) return 0;
+    for (int i = 0; i < PLACES; ++i) {
+        double s = deepest * i * i / (PLACES * PLACES), r2 = (2 * eye->radius - eye->p * s) * s;
+        double along = (eye->radius * (deep + s) - eye->p * deep * s) / far, y2 = r2 - along * along;
+        if (y2 < 0) continue;
+        double x = ex * along - ey * sqrt(y2), y = ey * along + ex * sqrt(y2);
+        // Snell's ray at grazing incidence: its way inside is that of least rise.
+        double root = sqrt(eye->radius * eye->radius - eye->p * r2), z = eye->apex - s;
+        double size = sqrt(r2 + root * root);
+        double u[3] = {x - site[0], y - site[1], z - site[2]}, u1 = sqrt(sim_dot(u, u));
+        double turn = sqrt(1 - 1 / (n * n)) / size, per_u = 1 / (n * u1);
+        double v[3] = {u[0] * per_u - turn * x, u[1] * per_u - turn * y, u[2] * per_u - turn * root};
+        double t = (eye->iris_z - z) / v[2], sx = x + t * v[0], sy = y + t * v[1];
+        if (!(v[2] < -1e-3 && t > 0 && sx * sx + sy * sy < 1.05 * eye->limbus * eye->limbus)) continue;
+        struct path path = measure(eye, site, sx, sy, x, y, n);
+        if (path.hxx * path.hyy - path.hxy * path.hxy < 0.002 || path.hxx <= 0) return 1;
+    }
+    return 0;
 }
 
 double sim_eye_refract(const struct sim_eye *eye, const double site[3], const double spot[3],
                        double exit[3]) {
     struct path t;
-    double at[2], n = eye->index;
-    guess(eye, site, spot[0], spot[1], &at[0], &at[1]);
+    struct place start = guess(eye, site, spot[0], spot[1]);
+    double at[2] = {start.x, start.y}, n = eye->index;
     int found = settle(eye, site, spot, n, at, &t) || follow(eye, site, spot, at, &t);
     double r2 = at[0] * at[0] + at[1] * at[1], far2 = furthest2(eye);
     if (!(r2 < far2)) {
@@ -150,7 +179,11 @@ SIM_WIDE void sim_cornea_refract(const struct sim_eye *eye, const double site[3]
     int n = sim_whole(s->n);
     double index = eye->index, far2 = furthest2(eye);
     double *x = s->exit[0], *y = s->exit[1], *z = s->exit[2];
-    SIM_EACH(p, n) guess(eye, site, s->x[p], s->y[p], &x[p], &y[p]);
+    SIM_EACH(p, n) {
+        struct place start = guess(eye, site, s->x[p], s->y[p]);
+        x[p] = start.x;
+        y[p] = start.y;
+    }
     for (int i = 0; i < steps; ++i)
         SIM_EACH(p, n) {
             struct path t = measure(eye, site, s->x[p], s->y[p], x[p], y[p], index);
@@ -166,8 +199,9 @@ SIM_WIDE void sim_cornea_refract(const struct sim_eye *eye, const double site[3]
         struct path t = measure(eye, site, s->x[p], s->y[p], x[p], y[p], index);
         double det = t.hxx * t.hyy - t.hxy * t.hxy, middle = (t.hxx + t.hyy) / 2, half = (t.hxx - t.hyy) / 2;
         double dx = t.hxy * t.gy - t.hyy * t.gx, dy = t.hxy * t.gx - t.hxx * t.gy;
-        double cos_out = facing(&t), least = middle - sqrt(half * half + t.hxy * t.hxy);
-        s->least[p] = cos_out > 0 ? least : -1.0;
+        double cos_out = facing(&t);
+        s->least[p] = middle - sqrt(half * half + t.hxy * t.hxy);
+        s->facing[p] = cos_out;
         s->step[p] = sqrt(dx * dx + dy * dy) / fabs(det);
         z[p] = t.z;
         double metric = 1 + t.zx * t.zx + t.zy * t.zy, per_size = 1 / sqrt(metric);
@@ -184,9 +218,10 @@ SIM_WIDE void sim_cornea_refract(const struct sim_eye *eye, const double site[3]
     }
 }
 
-void sim_cornea_mend(const struct sim_eye *eye, const double site[3], struct sim_spots *s, double *transfer) {
+void sim_cornea_mend(const struct sim_eye *eye, const double site[3], int folds, struct sim_spots *s,
+                     double *transfer) {
     for (int p = 0; p < s->n; ++p) {
-        if (s->least[p] > 1e-3 && s->step[p] < SETTLED_MM) continue;
+        if (s->least[p] > 1e-3 && s->step[p] < SETTLED_MM && (s->facing[p] > 0 || !folds)) continue;
         double spot[3] = {s->x[p], s->y[p], eye->iris_z}, exit[3];
         double t = sim_eye_refract(eye, site, spot, exit);
         for (int k = 0; k < 3; ++k) s->exit[k][p] = exit[k];

@@ -19,7 +19,7 @@ struct iris {
     struct sim_light *light;
     const double *axes, (*sites)[3];  // sites: eye frame
     const struct sim_lid *lids;
-    int n_lids;
+    int n_lids, folding, folds[2 * SIM_MAX_PORTS];  // whether any site's rays fold, which do
     double *ring, across[2], up[2];
     struct sim_spots at, probe;
 };
@@ -120,7 +120,7 @@ static void flush(struct iris *iris) {
     for (int k = 0; k < scene->n_sites; ++k) {
         double *transfer = light->transfer + k * SIM_BATCH;
         sim_cornea_refract(&scene->eye, iris->sites[k], NEWTON_STEPS, s, transfer);
-        sim_cornea_mend(&scene->eye, iris->sites[k], s, transfer);
+        sim_cornea_mend(&scene->eye, iris->sites[k], iris->folds[k], s, transfer);
         locate(iris->axes, scene->sites[k].position, s, k, light);
         if (scene->face.eye_clear[k]) continue;
         const double *alpha = light->alpha + k * SIM_BATCH, *beta = light->beta + k * SIM_BATCH;
@@ -172,6 +172,27 @@ static void probe_row(struct iris *iris, double chord, double u) {
     iris->probe.n = SIM_SAMPLES;
 }
 
+// Breaks at the edges of what a site whose rays fold lights of a row. Returns their number.
+static int break_edges(struct iris *iris, int k, double chord, double u, struct sim_breaks *breaks) {
+    const struct sim_eye *eye = &iris->scene->eye;
+    double *transfer = iris->light->transfer, exit[3];
+    int edges = 0;
+    sim_cornea_mend(eye, iris->sites[k], 1, &iris->probe, transfer);
+    for (int p = 0; p + 1 < SIM_SAMPLES; ++p) {
+        if ((transfer[p] > 0) == (transfer[p + 1] > 0)) continue;
+        double from = chord * (2.0 * p / (SIM_SAMPLES - 1) - 1), to = from + 2 * chord / (SIM_SAMPLES - 1);
+        for (int i = 0; i < 30; ++i) {
+            double v = (from + to) / 2, x = u * iris->across[0] + v * iris->up[0];
+            double spot[3] = {x, u * iris->across[1] + v * iris->up[1], eye->iris_z};
+            if ((sim_eye_refract(eye, iris->sites[k], spot, exit) > 0) == (transfer[p] > 0)) from = v;
+            else to = v;
+        }
+        sim_break_add(breaks, from, 1e-4);
+        ++edges;
+    }
+    return edges;
+}
+
 // One row of the disc about the axis: u across, v upward, both in the iris' plane.
 static void add_row(struct iris *iris, double radius, double u, double weight, double step_mm) {
     const struct sim_scene *scene = iris->scene;
@@ -183,9 +204,11 @@ static void add_row(struct iris *iris, double radius, double u, double weight, d
     double from = chord, to = -chord, edge_from = -chord, edge_to = chord;
     double lower[SIM_SAMPLES], upper[SIM_SAMPLES], full_lower[SIM_SAMPLES], full_upper[SIM_SAMPLES];
     struct sim_breaks breaks = {2, {-chord, chord}};
+    int edges = 0;
     for (int i = 0; i < scene->n_sites; ++i) {
         int k = (int)(light->order[i] - scene->sites);
         sim_cornea_refract(eye, iris->sites[k], PROBE_STEPS, probe, light->transfer);
+        if (iris->folds[k]) edges += break_edges(iris, k, chord, u, &breaks);
         locate(iris->axes, scene->sites[k].position, probe, k, light);
         for (int l = 0; l < iris->n_lids; ++l) {
             look(&iris->lids[l], light, k, lower, upper, full_lower, full_upper);
@@ -221,15 +244,20 @@ static void add_row(struct iris *iris, double radius, double u, double weight, d
         if (at < from || at > to) continue;
         if (fabs(at) > clear) h = fmin(h, STEP_VEIL * eye->haze);
         if (at < edge_from || at > edge_to) h = fmin(h, STEP_EDGE * iris->lids[0].softness);
-        int parts, n = sim_nodes_for(scene->quality.iris * (NODES_ROW + length / h), &parts);
+        double want = (edges ? 2 : 1) * (NODES_ROW + length / h);
+        int parts, n = sim_nodes_for(scene->quality.iris * want, &parts);
         const double *rule = scene->rule[n];
         double half = length / (2 * parts);
         for (int j = 0; j < n * parts; ++j) {
-            double v = breaks.at[i] + half * (2 * (j / n) + 1 + rule[j % n]);
+            double t = half * (2 * (j / n) + 1 + rule[j % n]), v = breaks.at[i] + t, stretch = 1;
+            if (edges) {  // an inverse square root at either end becomes smooth
+                v = at - length / 2 * cos(PI * t / length);
+                stretch = PI / 2 * sin(PI * t / length);
+            }
             int p = iris->at.n++;
             iris->at.x[p] = u * iris->across[0] + v * iris->up[0];
             iris->at.y[p] = u * iris->across[1] + v * iris->up[1];
-            iris->at.weight[p] = weight * half * rule[n + j % n];
+            iris->at.weight[p] = weight * half * stretch * rule[n + j % n];
             if (iris->at.n == SIM_BATCH) flush(iris);
         }
     }
@@ -271,7 +299,7 @@ static void add_disc(struct iris *iris, double radius, double factor, double ste
         int parts;
         double from = breaks.at[piece], length = breaks.at[piece + 1] - from;
         double step = fmin(step_mm, iris->n_lids > 2 ? 0.6 * STEP_ACROSS : STEP_ACROSS);
-        double want = NODES_ACROSS + radius * length / step;
+        double want = (iris->folding ? 3 : 1) * (NODES_ACROSS + radius * length / step);
         int n = sim_nodes_for(iris->scene->quality.iris * want, &parts);
         const double *rule = iris->scene->rule[n];
         double half = length / (2 * parts);
@@ -309,6 +337,9 @@ int sim_add_iris(const struct sim_scene *scene, struct sim_light *light, const d
     double step = 1e9, up = sqrt(axes[3] * axes[3] + axes[4] * axes[4]);
     for (int i = 0; i < light->n_foci; ++i) step = fmin(step, STEP_FOCUS * light->foci[i].scale_mm);
     iris->scene = scene;
+    iris->folding = 0;
+    for (int k = 0; k < scene->n_sites; ++k)
+        iris->folding |= iris->folds[k] = sim_cornea_folds(eye, sites[k]);
     iris->light = light;
     iris->axes = axes;
     iris->sites = (const double(*)[3])sites;
