@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `map`: what each sensor of a headset receives over gaze, on a simulated person."""
 
-import os
-
 import click
 
 from .cli_device import json_option
@@ -120,13 +118,14 @@ def map_command(
         sparsegaze map headsets/led2gaze.toml --method image --pixels 64 --bits 8 -o image.npz
     """
     from . import maps
+    from .output import check_output
 
     _refuse_misfits(sweep, elevation, azimuth, method, pixels, bits, clip, renderer)
-    for path in filter(None, (output, png)):
-        _writable(path)
+    check_output(output, ".npz", (headset, person))
     if png:
         from .mapfigure import picture_kind
 
+        check_output(png, None, (headset, person, output))
         picture_kind(png)
     console = Console(as_json)
     common = dict(
@@ -179,19 +178,6 @@ def _refuse_misfits(sweep, elevation, azimuth, method, pixels, bits, clip, rende
         raise click.UsageError("--pixels, --bits, --clip and --renderer go with --method image")
 
 
-def _writable(path):
-    """Find out before the work whether a file can be put there."""
-    from .errors import SceneError
-
-    folder = os.path.dirname(path) or "."
-    if not os.path.isdir(folder):
-        raise SceneError(
-            f"there is no folder {folder} to write {os.path.basename(path)} into", "create it first"
-        )
-    if os.path.isdir(path) or not os.access(folder, os.W_OK):
-        raise SceneError(f"{path} cannot be written", "choose another place")
-
-
 def _report(made, output, png):
     """The command's result as data."""
     from .ring import ring_of_sensors
@@ -209,6 +195,7 @@ def _report(made, output, png):
         "mean": made.mean,
         "rings": ring_of_sensors(made),
         "estimate_rms": made.estimate_rms,
+        "tolerance_met": bool(made.estimate_rms["total"] <= made.tol) if known else None,
         "error_bound": float(made.error_estimate.max() / made.mean) if known and made.mean else None,
         "left_out": made.left_out,
         "seconds": made.seconds,
@@ -228,20 +215,21 @@ def _words(made, output, png):
         ("mean", f"{made.mean:.3e} /mm2 of a pair"),
     ]
     if data["rings"]:
-        best = max(data["rings"], key=lambda ring: ring["glint_percent"])
+        best = max(data["rings"], key=lambda ring: (ring["within"], ring["glint_percent"]))
         items.append(
             (
-                "ring",
+                "glint",
                 f"brightest for sensor {best['sensor']} at azimuth {best['azimuth_deg']:.1f}, elevation "
-                f"{best['elevation_deg']:.1f} deg: the glint is {best['glint_percent']:.0f} % of the rest",
+                f"{best['elevation_deg']:.1f} deg{'' if best['within'] else ' (the border)'}: "
+                f"{best['glint_percent']:.0f} % of the rest",
             )
         )
     if data["error_bound"] is not None:
         items.append(
             (
                 "error",
-                f"estimated {made.estimate_rms['total']:.1e} rms, at most {data['error_bound']:.1e} at any "
-                "gaze, of the mean",
+                f"expected {made.estimate_rms['total']:.1e} rms of the mean; guaranteed below "
+                f"{data['error_bound']:.1e} for every pair and gaze",
             )
         )
         if made.estimate_rms["total"] > made.tol:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `study`: maps of many placements on many people."""
 
-import os
-
 import click
 
 from .cli_device import json_option
@@ -66,15 +64,12 @@ def study(headsets, output, persons, workers, grid, half_angle, tol, pupil, lids
     \b
     Example:
         sparsegaze study headsets/led2gaze.toml --persons 0-19 -o study.npz
-        sparsegaze study a.toml b.toml --persons 0-4 --lids 1 --lids 0.5 --workers 8 -o both.npz --json
+        sparsegaze study a.toml b.toml --persons 0-4 --lids 1 --lids 0.5 -o both.npz --json
     """
+    from .output import check_output
     from .study import sweep
 
-    folder = os.path.dirname(output) or "."
-    if not os.path.isdir(folder) or not os.access(folder, os.W_OK):
-        from .errors import SceneError
-
-        raise SceneError(f"{output} cannot be written", "create its folder, or choose another place")
+    check_output(output, ".npz", headsets)
     console = Console(as_json)
     with console.progress() as bar:
         made = sweep(

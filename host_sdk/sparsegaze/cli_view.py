@@ -110,10 +110,12 @@ def view_command(
     from .headset import load_headset
     from .image import view
     from .mapfigure import picture_kind
+    from .output import check_output
 
     picture_kind(output)
-    for path in filter(None, (output, npz)):
-        writable(path)
+    check_output(output, None, (headset, person))
+    if npz:
+        check_output(npz, ".npz", (headset, person, output))
     console = Console(as_json)
     worn = load_headset(headset)
     who = person_of(person)
@@ -170,18 +172,6 @@ def _called(person):
     if person.isdigit():
         return "simulated person %s" % person
     return "simulated person of %s" % os.path.basename(person)
-
-
-def writable(path):
-    """Find out before the work whether a file can be put there. SceneError otherwise."""
-    from .errors import SceneError
-
-    folder = os.path.dirname(path) or "."
-    if not os.path.isdir(folder):
-        name = os.path.basename(path)
-        raise SceneError(f"there is no folder {folder} to write {name} into", "create it first")
-    if os.path.isdir(path) or not os.access(folder, os.W_OK):
-        raise SceneError(f"{path} cannot be written", "choose another place")
 
 
 COMMANDS = {"view": view_command}

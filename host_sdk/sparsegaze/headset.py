@@ -71,8 +71,10 @@ def _vector(entry, key, where):
     value = entry.get(key)
     ok = isinstance(value, list) and len(value) == 3
     ok = ok and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value)
-    if not ok or not np.isfinite(value).all() or np.abs(value).max() > 1e4:
+    if not ok or not np.isfinite(value).all():
         raise SceneError("%s: %s must be three finite numbers, millimetres" % (where, key), _REMEDY)
+    if np.abs(value).max() > 1e4:
+        raise SceneError("%s: %s is more than 10 m away" % (where, key), _REMEDY)
     return tuple(float(v) for v in value)
 
 

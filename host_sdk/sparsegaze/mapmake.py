@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from . import mapplan
+from .errors import SceneError
 from .mapcall import calls
 from .mapjudge import bend, counted_pairs, hardest, mean_response, scale_of
 from .mapneed import Chosen, hidden_eye, may_see, other_ports
@@ -120,6 +121,8 @@ class Making:
         rough = Scene(self.headset, self.person, self._middle, {"face": 0.35})
         light = self.pilot.of(rough, "face") + sum(self.pilot.value(term, 0) for term in TERMS[1:])
         self.mean = float(light[:, counted_pairs(self.pairs)].mean())
+        if not self.mean > 0:
+            raise SceneError("no sensor receives any light", "check the aims, and where the eye is")
         self.rung, self.quality = {}, {}
         for term in TERMS[1:]:
             self._settle(term, self.pilot.choose(term, SHARE * self.tol * self.mean, self._rms, PEAK))
@@ -133,7 +136,7 @@ class Making:
         self.rung["face"], self.quality["face"] = rung, mapplan.fineness("face", rung)
         self._scenes[tuple(self._middle), "", 0] = scene
         self._keep("face", error, self.pilot.value("face", rung).max(0))
-        self.rms["face"] = mapplan.RMS_SAFETY * self._rms(error) / max(self.mean, 1e-300)
+        self.rms["face"] = mapplan.RMS_SAFETY * self._rms(error) / self.mean
 
     def _leave_out(self):
         """Find the ports that provably see nothing of a term."""
@@ -166,7 +169,7 @@ class Making:
         self.rung[term], self.quality[term] = rung, mapplan.fineness(term, rung)
         error = self.pilot.error(term, rung)
         self._keep(term, error, np.abs(self.pilot.value(term, rung)).max(0))
-        self.rms[term] = mapplan.RMS_SAFETY * self._rms(error) / max(self.mean, 1e-300)
+        self.rms[term] = mapplan.RMS_SAFETY * self._rms(error) / self.mean
 
     def _permit_mirror(self):
         """Let mirror points stand in for the lobe where sim_c's own estimate allows it, when the pilot's
@@ -355,7 +358,7 @@ class Making:
             here = np.sqrt(np.mean([rough[at] ** 2 for at in chosen])) if chosen else 0.0
             if here > 0:
                 rms = mapplan.RMS_SAFETY * self._rms(error) * np.sqrt((rough**2).mean()) / here
-                self.rms[term] = max(self.rms[term], float(rms / max(self.mean, 1e-300)))
+                self.rms[term] = max(self.rms[term], float(rms / self.mean))
         return bad
 
     def _lattice(self):

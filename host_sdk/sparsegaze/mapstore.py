@@ -53,45 +53,49 @@ def read_map(path):
         raise SceneError("%s: %s" % (name, why), "sparsegaze map writes such files; make it again")
 
     try:
-        with zipfile.ZipFile(path) as archive:
-            found = {
-                info.filename[:-4]: _member(archive, info, refuse)
-                for info in archive.infolist()
-                if info.filename.endswith(".npy")
-            }
+        found = read_arrays(path)
     except OSError as error:
         raise SceneError("%s: %s" % (path, error.strerror or "cannot be read"), "give the path of a map")
-    except (
-        zipfile.BadZipFile,
-        NotImplementedError,
-        RuntimeError,
-        ValueError,
-        EOFError,
-        MemoryError,
-    ) as error:
-        if isinstance(error, SceneError):
-            raise
+    except Damaged as error:
         refuse("not a map, or damaged (%s)" % error)
     return _fields(found, refuse)
 
 
-def _member(archive, info, refuse):
+class Damaged(Exception):
+    """An archive that is not what its writer wrote."""
+
+
+def read_arrays(path):
+    """{name: array} of an .npz archive of numbers and text. OSError when it cannot be opened, Damaged when
+    anything in it is not as it should be; no array is larger than its file says.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = [info for info in archive.infolist() if info.filename.endswith(".npy")]
+            return {info.filename[:-4]: _member(archive, info) for info in members}
+    except (OSError, Damaged):
+        raise
+    except Exception as error:  # zipfile, zlib, struct, tokenize and numpy each have errors of their own
+        raise Damaged("%s: %s" % (type(error).__name__, error))
+
+
+def _member(archive, info):
     """One array of an archive, after its header was seen to be what its length allows."""
     if info.file_size > MOST_BYTES:
-        refuse("%s is too large" % info.filename)
+        raise Damaged("%s is too large" % info.filename)
     with archive.open(info) as file:
         version = np.lib.format.read_magic(file)
         if version not in ((1, 0), (2, 0)):
-            refuse("%s is of an unknown version" % info.filename)
+            raise Damaged("%s is of an unknown version" % info.filename)
         read = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}[version[0]]
         shape, _, dtype = read(file)
         if dtype.hasobject or dtype.kind not in "fiU":
-            refuse("%s holds %s" % (info.filename, dtype))
+            raise Damaged("%s holds %s" % (info.filename, dtype))
         expected = dtype.itemsize
         for length in shape:
             expected *= int(length)
         if expected > info.file_size:
-            refuse("%s is shorter than it says" % info.filename)
+            raise Damaged("%s is shorter than it says" % info.filename)
     with archive.open(info) as file:
         return np.lib.format.read_array(file, allow_pickle=False)
 

@@ -8,6 +8,7 @@ values);
 the spread of roughness, limbus, face relief and of the headset's seat are assumptions.
 """
 
+import os
 from dataclasses import asdict, dataclass, fields
 from typing import Tuple
 
@@ -15,6 +16,8 @@ import numpy as np
 
 from .errors import SceneError
 
+
+MOST_BYTES = 1 << 20  # of a TOML file
 
 # Part of the gaze's elevation that the upper lid's margin follows: [eye].lid_follow_gain of physics.toml.
 LID_FOLLOW_GAIN = 0.9
@@ -138,8 +141,13 @@ def read_toml(path):
     except ImportError:  # Python < 3.11
         import tomli as tomllib
     try:
+        if os.path.exists(path) and not os.path.isfile(path):
+            raise SceneError("%s is not a file" % path, "give the path of a TOML file")
         with open(path, "rb") as file:
-            return tomllib.load(file)
+            text = file.read(MOST_BYTES + 1)
+        if len(text) > MOST_BYTES:
+            raise SceneError("%s is larger than 1 MB" % path, "give the path of a TOML file")
+        return tomllib.loads(text.decode())
     except OSError as error:
         raise SceneError(
             "%s: %s" % (path, error.strerror or "cannot be read"), "give the path of a TOML file"

@@ -59,7 +59,8 @@ def ring_figures(person=None, lens_radius_mm=LENS_RADIUS_MM):
 
 def ring_of_sensors(made, state=0):
     """Where each sensor's glint is brightest against everything else, other emitters lit: a list of
-    {sensor, azimuth_deg, elevation_deg, glint_percent}. Empty when the parts were not kept.
+    {sensor, azimuth_deg, elevation_deg, glint_percent, within (false: on the map's border, so that the
+    brightest place may lie outside)}. Empty when the parts were not kept; no entry without a glint.
     """
     if not made.parts:
         return []
@@ -68,12 +69,16 @@ def ring_of_sensors(made, state=0):
         rest = total - glint
         share = np.divide(glint, rest, out=np.zeros_like(glint), where=rest > 0)
         row, column = np.unravel_index(np.argmax(share), share.shape)
+        if not share[row, column] > 0:
+            continue
+        inner = [0 < at < size - 1 or size == 1 for at, size in zip((row, column), share.shape)]
         rings.append(
             {
                 "sensor": sensor,
                 "azimuth_deg": float(made.azimuth_deg[column]),
                 "elevation_deg": float(made.elevation_deg[row]),
                 "glint_percent": 100 * float(share[row, column]),
+                "within": all(inner),
             }
         )
     return rings

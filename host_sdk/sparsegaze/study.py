@@ -10,13 +10,13 @@ with more people or placements computes only those.
 """
 
 import concurrent.futures
+import functools
 import hashlib
 import json
 import multiprocessing
 import os
 import queue
 import signal
-import zipfile
 from collections import namedtuple
 from dataclasses import dataclass, field
 
@@ -25,6 +25,7 @@ import numpy as np
 from . import __version__
 from .errors import SceneError, SparsegazeError
 from .headset import Headset
+from .mapstore import Damaged, read_arrays
 from .person import Person
 from .scene import simulator
 from .simulate import as_headset, as_person
@@ -78,11 +79,11 @@ class Study:
     def load(cls, path):
         """Read a file that `save` wrote. SceneError for any other."""
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in _STUDY_ARRAYS}
-                said = json.loads(str(file["said"]))
+            file = read_arrays(path)
+            arrays = {name: file[name] for name in _STUDY_ARRAYS}
+            said = json.loads(str(file["said"]))
             return cls(**arrays, failures=[Failure(*failure) for failure in said["failures"]])
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        except (OSError, Damaged, ValueError, KeyError, TypeError, RecursionError) as error:
             raise SceneError("%s is not a study (%s)" % (path, error), "make it with sparsegaze study")
 
 
@@ -116,11 +117,21 @@ def compute_item(headset, person, options):
 _AXES = ("pupil_mm", "lid_opening", "slip_mm", "azimuth_deg", "elevation_deg")
 
 
+@functools.cache
+def _driver_source():
+    """Hash of the modules that choose how finely a map is integrated: other choices are other numbers."""
+    digest, here = hashlib.sha256(), os.path.dirname(os.path.abspath(__file__))
+    for name in ("maps", "mapmake", "mapplan", "mapcall", "mapneed", "mapjudge"):
+        with open(os.path.join(here, name + ".py"), "rb") as file:
+            digest.update(file.read())
+    return digest.hexdigest()
+
+
 def item_name(headset, person, options):
     """File name of an item: the hash of headset, person, options and the simulator's own source."""
     ffi, lib = simulator()
     text = repr((headset.describe(), person.describe(), sorted(options.items()), ITEM_VERSION, __version__))
-    text += ffi.string(lib.sim_source_hash).decode()
+    text += ffi.string(lib.sim_source_hash).decode() + _driver_source()
     return hashlib.sha256(text.encode()).hexdigest()[:32] + ".npz"
 
 
@@ -273,9 +284,11 @@ def _run(executor, arguments, finished):
 def read_item(path):
     """The arrays of an item file, or None when it is not there or damaged."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            made = {name: file[name] for name in _ITEM_ARRAYS + _AXES}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        file = read_arrays(path)
+        made = {name: file[name] for name in _ITEM_ARRAYS + _AXES}
+    except (OSError, Damaged, KeyError):
+        return None
+    if any(values.dtype != np.float64 for values in made.values()):
         return None
     shape = made["response"].shape
     whole = len(shape) == 5 and made["error_estimate"].shape == shape[:3] and made["mean"].shape == ()

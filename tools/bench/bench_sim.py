@@ -154,10 +154,14 @@ def bars(report):
         most("map of 41 x 41 x 30, seconds", report["speed"]["seconds"], 5.0)
         most("map of 41 x 41 x 30, seconds", report["speed"]["seconds"], 1.0, "aim")
         most("map's rms_total", report["speed"]["rms_total"], 1e-4)
+        most("map's max_total", report["speed"]["max_total"], 1e-3)
+        least("map's error is bounded", float(report["speed"]["estimate_bounds"]), 1)
     if "offgrid" in report:
         for words, key in (("", ""), (", lids open", "_lids_open")):
             most("off the grid%s, rms" % words, report["offgrid"]["rms" + key], 1e-4)
             most("off the grid%s, max" % words, report["offgrid"]["max" + key], 1e-3)
+        most("off the grid against the reference, rms", report["offgrid"]["rms_against_reference"], 1e-4)
+        most("off the grid against the reference, max", report["offgrid"]["max_against_reference"], 1e-3)
         least(
             "off the grid, responses a second and core", report["offgrid"]["responses_per_second_core"], 20000
         )
