@@ -19,7 +19,8 @@ struct iris {
     struct sim_light *light;
     const double *axes, (*sites)[3];  // sites: eye frame
     const struct sim_lid *lids;
-    int n_lids, folding, folds[2 * SIM_MAX_PORTS];  // whether any site's rays fold, which do
+    int n_lids, folds[2 * SIM_MAX_PORTS];  // whether a site's rays fold
+    int uneven;  // whether any site's do, or the face hides some of the eye from it
     double *ring, across[2], up[2];
     struct sim_spots at, probe;
 };
@@ -299,7 +300,7 @@ static void add_disc(struct iris *iris, double radius, double factor, double ste
         int parts;
         double from = breaks.at[piece], length = breaks.at[piece + 1] - from;
         double step = fmin(step_mm, iris->n_lids > 2 ? 0.6 * STEP_ACROSS : STEP_ACROSS);
-        double want = (iris->folding ? 3 : 1) * (NODES_ACROSS + radius * length / step);
+        double want = (iris->uneven ? 3 : 1) * (NODES_ACROSS + radius * length / step);
         int n = sim_nodes_for(iris->scene->quality.iris * want, &parts);
         const double *rule = iris->scene->rule[n];
         double half = length / (2 * parts);
@@ -337,9 +338,11 @@ int sim_add_iris(const struct sim_scene *scene, struct sim_light *light, const d
     double step = 1e9, up = sqrt(axes[3] * axes[3] + axes[4] * axes[4]);
     for (int i = 0; i < light->n_foci; ++i) step = fmin(step, STEP_FOCUS * light->foci[i].scale_mm);
     iris->scene = scene;
-    iris->folding = 0;
-    for (int k = 0; k < scene->n_sites; ++k)
-        iris->folding |= iris->folds[k] = sim_cornea_folds(eye, sites[k]);
+    iris->uneven = 0;
+    for (int k = 0; k < scene->n_sites; ++k) {
+        iris->folds[k] = sim_cornea_folds(eye, sites[k]);
+        iris->uneven |= iris->folds[k] || !scene->face.eye_clear[k];
+    }
     iris->light = light;
     iris->axes = axes;
     iris->sites = (const double(*)[3])sites;
