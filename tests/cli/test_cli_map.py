@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`sparsegaze map` as its user meets it: files, words, refusals; and the person files it is given."""
 
+import json
 import os
 import re
 from dataclasses import asdict, fields
@@ -216,3 +217,33 @@ def test_a_person_file_with_an_unknown_key_is_refused(tmp_path):
     (tmp_path / "p.toml").write_text("[person]\nbrows_mm = 3\n")
     with pytest.raises(SceneError, match="brows_mm"):
         load_person(tmp_path / "p.toml")
+
+
+def test_a_map_never_replaces_the_headset_or_the_person_it_is_made_from(command, led2gaze_file, tmp_path):
+    for name in ("headset.npz", "person.npz"):
+        text = open(led2gaze_file).read() if name[0] == "h" else "[person]\n"
+        (tmp_path / name).write_text(text)
+    headset, person = str(tmp_path / "headset.npz"), str(tmp_path / "person.npz")
+    for output in (headset, person):
+        code, _, err = command("map", headset, "--person", person, *QUICK, "-o", output)
+        assert code != 0 and "is what the command reads" in err
+    assert open(headset).read() == open(led2gaze_file).read() and open(person).read() == "[person]\n"
+
+
+def test_a_map_is_called_npz(command, led2gaze_file, tmp_path):
+    code, _, err = command("map", led2gaze_file, *QUICK, "-o", tmp_path / "map.txt")
+    assert code != 0 and "does not end in .npz" in err
+    assert not os.listdir(tmp_path)
+
+
+def test_a_scene_without_light_is_said_to_have_none(command, led2gaze_file, tmp_path):
+    (tmp_path / "far.toml").write_text("[person]\neye_position_mm = [1000.0, 0.0, 0.0]\n")
+    options = ["--person", tmp_path / "far.toml", "-o", tmp_path / "map.npz"]
+    code, _, err = command("map", led2gaze_file, *QUICK, *options)
+    assert code != 0 and "no sensor receives any light" in err
+    assert not os.path.exists(tmp_path / "map.npz")
+
+
+def test_json_says_whether_the_tolerance_was_met(command, led2gaze_file, tmp_path):
+    code, out, _ = command("map", led2gaze_file, *QUICK, "-o", tmp_path / "map.npz", "--json")
+    assert code == 0 and json.loads(out)["tolerance_met"] is True

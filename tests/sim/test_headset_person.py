@@ -90,6 +90,19 @@ def test_a_missing_headset_file_is_refused(tmp_path):
         load_headset(str(tmp_path / "none.toml"))
 
 
+@pytest.mark.parametrize("path", ["/dev/zero", "/dev"])
+def test_what_is_no_file_is_refused_at_once(path):
+    with pytest.raises(SceneError, match="not a file"):
+        load_headset(path)
+
+
+def test_an_endless_file_is_not_read_to_its_end(tmp_path):
+    with open(tmp_path / "long.toml", "wb") as file:
+        file.truncate(1 << 33)
+    with pytest.raises(SceneError, match="larger than 1 MB"):
+        load_headset(str(tmp_path / "long.toml"))
+
+
 def scene_refusal(sensor, person=Person()):
     with pytest.raises(SceneError) as caught:
         Scene(pair(sensor, port((10, -10, -30))), person)

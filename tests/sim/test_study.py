@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Studies: the same results over every executor, resumed after a kill, and one bad item among good ones."""
 
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+import zipfile
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
@@ -129,7 +131,23 @@ def test_a_second_run_computes_nothing_and_more_people_only_the_new_ones(headset
     np.testing.assert_array_equal(more.response[:, 1], first.response[:, 0])
 
 
-@pytest.mark.parametrize("damage", ["cut", "bit", "empty", "pickle", "other"])
+def with_header(text):
+    """An archive with one array whose header is the given text."""
+    header = text.encode().ljust(118) + b"\n"
+    member = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(8)
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w") as archive:
+        archive.writestr("response.npy", member)
+    return held.getvalue()
+
+
+HEADERS = {
+    "bracket": "{'descr': '<f8', 'fortran_order': False, 'shape': ((1,), }",
+    "huge": "{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999999,), }",
+}
+
+
+@pytest.mark.parametrize("damage", ["cut", "bit", "empty", "pickle", "other", *HEADERS])
 def test_a_damaged_item_is_made_again(headsets, expected, tmp_path, damage):
     sweep(headsets, [3, 8], directory=tmp_path, executor=Inline(), **QUICK)
     path = sorted(tmp_path.iterdir())[1]
@@ -142,6 +160,8 @@ def test_a_damaged_item_is_made_again(headsets, expected, tmp_path, damage):
     elif damage == "other":
         np.savez(path, response=np.zeros(3))
         data = path.read_bytes()
+    elif damage in HEADERS:
+        data = with_header(HEADERS[damage])
     path.write_bytes({"cut": data[: len(data) // 2], "empty": b""}.get(damage, bytes(data)))
     assert read_item(path) is None
     made = sweep(headsets, [3, 8], directory=tmp_path, executor=Inline(), **QUICK)
@@ -260,7 +280,7 @@ def test_a_worker_that_dies_is_reported_and_finished_items_stay(headsets, tmp_pa
 
 
 def test_files_that_are_no_study_are_refused(tmp_path):
-    for content in (b"", b"PK\x03\x04 and rubbish", b"plain"):
+    for content in (b"", b"PK\x03\x04 and rubbish", b"plain", *map(with_header, HEADERS.values())):
         (tmp_path / "x.npz").write_bytes(content)
         with pytest.raises(SceneError):
             Study.load(tmp_path / "x.npz")
