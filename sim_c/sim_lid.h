@@ -39,7 +39,8 @@ void sim_lid_measure(const struct sim_lid *lid, double alpha, double beta, doubl
 double sim_lid_open(const struct sim_lid *lid, const struct sim_lid_point *point);
 
 // The same seen along a unit vector (from the point): a margin stands lid_thickness_mm off the eye, and the
-// upper lashes dim, by lash_opacity, what a margin of lash_length_mm instead would hide. Closed lids hide all.
+// upper lashes dim, by lash_opacity, what a margin of lash_length_mm instead would hide. Closed lids hide
+// all.
 double sim_lid_open_toward(const struct sim_lid *lid, const struct sim_lid_point *point,
                            const double toward[3]);
 
