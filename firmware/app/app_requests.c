@@ -142,7 +142,11 @@ static void infer(void)
     uint16_t feature[HAL_CHANNELS];
     memcpy(feature, body.infer.feature, sizeof feature);
     const uint8_t flags = app_model_slot() == SG_SLOT_RAM ? SG_FLAG_TRIAL : 0;
-    sg_track_infer(app_model(), feature, flags, app_recentre(), &body.gaze);
+    const struct sg_model_view *model = app_model();
+    const int16_t *recentre = app_recentre();
+    HAL_BEGIN(HAL_SECTION_REQUEST);
+    sg_track_infer(model, feature, flags, recentre, &body.gaze);
+    HAL_END(HAL_SECTION_REQUEST);
 }
 
 static int8_t trial_write(uint8_t n)

@@ -30,6 +30,7 @@ COMMANDS = {
     "calibrate": ("cli_gaze", "Targets, recording, fit, upload and validation in one go."),
     "record": ("cli_gaze", "Record raw features while targets are shown."),
     "fit": ("cli_gaze", "Make a model from a recording (no device needed)."),
+    "predict": ("cli_predict", "A model's answers from a target's own binary, with its cycles."),
     "upload": ("cli_device", "Put a model into the device, safe against power cuts."),
     "validate": ("cli_gaze", "Measure the device's gaze on held-out targets."),
     "recentre": ("cli_gaze", "Put a shifted headset right with one look at the centre."),

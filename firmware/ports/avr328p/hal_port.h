@@ -20,6 +20,7 @@ enum hal_section {
     HAL_SECTION_SENSE = 3,      // sensing interrupts
     HAL_SECTION_SERIAL = 4,     // UART interrupts
     HAL_SECTION_FRAME = 5,      // all of a frame in the main loop, from taking its samples on
+    HAL_SECTION_REQUEST = 6,    // sg_track_infer for SG_MSG_INFER, apart from the live frames'
 };
 
 #define HAL_BEGIN(section) (GPIOR0 = (uint8_t)(2 * (section) + 1))

@@ -17,6 +17,7 @@ enum hal_section {
     HAL_SECTION_SENSE = 3,
     HAL_SECTION_SERIAL = 4,
     HAL_SECTION_FRAME = 5,
+    HAL_SECTION_REQUEST = 6,
 };
 
 #define HAL_BEGIN(section) ((void)(section))

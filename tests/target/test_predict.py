@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""predict: every target's own binary gives the same bytes, and what the command says of them."""
+
+import itertools
+import json
+import math
+
+import numpy as np
+import pytest
+
+from conftest import random_features, random_model
+
+from sparsegaze import predict as module
+from sparsegaze.cli import run
+from sparsegaze.errors import ModelError, RecordingError
+from sparsegaze.model import CHANNELS, FLAG_OUT_OF_RANGE, FLAG_VALID
+from sparsegaze.predict import CYCLES_EXACT, predict
+from sparsegaze.recording import Recording
+
+MODELS = {"64 vectors": (64, 6), "one vector, one channel": (1, 1), "three channels": (20, 3),
+          "216 vectors": (216, 6)}
+
+
+def hard_features(n=500, seed=0):
+    """[n, 6]: all 0, all 65535, every corner of the box that random_model spans, then random ones."""
+    corners = np.array(list(itertools.product((31000, 40000), repeat=CHANNELS)))
+    ends = np.array([[0] * CHANNELS, [65535] * CHANNELS, [0, 65535] * 3, [65535, 0] * 3])
+    features = np.concatenate([ends, corners, random_features(n - len(ends) - len(corners), seed)])
+    assert len(features) == n
+    return features.astype(np.uint16)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_target_gives_the_same_bytes(name):
+    vectors, channels = MODELS[name]
+    model = random_model(vectors, seed=vectors, channels=channels)
+    features = hard_features(seed=vectors)
+    done = {target: predict(model, features, target) for target in module.TARGETS}
+    crc = {one.crc for one in done.values()}
+    print(f"output CRC-32 over {len(features)} predictions, {name}: "
+          + ", ".join(f"{target} {one.crc:08x}" for target, one in done.items()))
+    first = done["host"].gaze.tobytes()
+    assert len(first) == 12 * len(features)
+    for target, one in done.items():
+        assert one.gaze.tobytes() == first, target
+    assert len(crc) == 1
+    assert 0 < done["host"].valid.sum() < len(features), "the features do not try both sides of the range"
+
+
+def test_the_host_is_what_the_model_predicts():
+    model, features = random_model(64), random_features(200)
+    done = predict(model, features)
+    azimuth, elevation, flags = model.predict(features)[:3]
+    assert np.array_equal(done.azimuth_deg, azimuth) and np.array_equal(done.elevation_deg, elevation)
+    assert np.array_equal(done.flags, flags)
+    assert done.cycle_kind is None and done.cycles_min is None
+
+
+def test_a_wrong_bit_changes_the_crc():
+    done = predict(random_model(8), random_features(50))
+    gaze = done.gaze.copy()
+    gaze["elevation_deg_q7"][49] ^= 1
+    assert module.Prediction("host", gaze, 0).crc != done.crc
+
+
+def test_the_nano_counts_the_cycles_of_the_requests_alone(board, tmp_path):
+    model = random_model(64)
+    features = random_features(300)
+    inside = features[(features > 31000).all(1) & (features < 40000).all(1)]
+    done = predict(model, inside, "nano")
+    assert done.cycle_kind == CYCLES_EXACT and 0 < done.cycles_min <= done.cycles_max
+    # The same section of the same features over the device's own line, live frames beside it.
+    nano, device = board(models={0: model.image})
+    device.set_stream(raw=True, gaze=True)
+    nano.control.markers_clear()
+    device.infer(inside)
+    section = nano.control.markers()["6n"]
+    assert (section.least, section.most) == (done.cycles_min, done.cycles_max)
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A model and a recording of 40 rows, 30 of them valid: (model path, recording path, Recording)."""
+    model, features = random_model(16), random_features(40)
+    azimuth, elevation, _ = model.predict(features)[:3]
+    valid = np.arange(40) % 4 != 0
+    # A target of 1 deg to the right of every prediction that is an angle at all.
+    target = np.clip(np.stack([azimuth + 1.0, elevation], 1), -80, 80)
+    recording = Recording(np.arange(40), features, target, valid)
+    model.save(tmp_path / "m.sgm")
+    recording.write(tmp_path / "r.csv")
+    return str(tmp_path / "m.sgm"), str(tmp_path / "r.csv"), recording
+
+
+def test_json_holds_one_gaze_per_valid_row_in_order(files, capsys):
+    model, path, recording = files
+    assert run(["predict", model, path, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    done = predict(random_model(16), recording.features[recording.valid])
+    assert said["n"] == 30 == len(said["azimuth_deg"]) == len(said["elevation_deg"]) == len(said["flags"])
+    assert said["azimuth_deg"] == done.azimuth_deg.tolist() and said["flags"] == done.flags.tolist()
+    assert len(said["sigma_deg"]) == 30
+    assert all(value is None or value > 0 for value in said["sigma_deg"])
+    assert all(math.isfinite(value) for value in said["azimuth_deg"] + said["elevation_deg"])
+    assert said["output_crc"] == done.crc and said["model_crc"] == random_model(16).crc
+    assert said["cycles_min"] is said["cycles_max"] is said["cycle_kind"] is None and said["target"] == "host"
+
+
+def test_rows_out_of_range_keep_their_numbers_and_are_flagged(tmp_path, capsys):
+    model = random_model(16)
+    model.save(tmp_path / "m.sgm")
+    rows = [",".join([value] * CHANNELS) for value in ("0", "65535")]
+    (tmp_path / "f.csv").write_text("\n".join(["s0,s1,s2,s3,s4,s5", *rows]) + "\n")
+    assert run(["predict", str(tmp_path / "m.sgm"), str(tmp_path / "f.csv"), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert all(flags & FLAG_OUT_OF_RANGE and not flags & FLAG_VALID for flags in said["flags"])
+    assert all(isinstance(value, float) for value in said["azimuth_deg"] + said["elevation_deg"])
+    assert "error" not in said      # the file has no targets
+
+
+def test_error_to_the_targets_is_told_over_the_rows_that_are_a_gaze(files, capsys):
+    model, path, recording = files
+    assert run(["predict", model, path, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    rows = recording.select(recording.valid)
+    done = predict(random_model(16), rows.features)
+    assert said["error"]["rows"] == done.valid.sum() > 0
+    expected = module.target_error(done, rows)
+    assert said["error"]["mean_deg"] == pytest.approx(expected.mean_deg, rel=1e-4)   # %.6g in the file
+
+
+def test_the_output_file_holds_what_json_says(files, tmp_path, capsys):
+    model, path, _ = files
+    out = tmp_path / "gaze.csv"
+    assert run(["predict", model, path, "--json", "-o", str(out)]) == 0
+    said = json.loads(capsys.readouterr().out)
+    lines = [line for line in out.read_text().splitlines() if not line.startswith("#")]
+    assert lines[0] == "row,azimuth_deg,elevation_deg,flags,sigma_deg" and len(lines) == 31
+    azimuth = [float(line.split(",")[1]) for line in lines[1:]]
+    assert azimuth == said["azimuth_deg"]
+
+
+def test_text_and_help_fit_a_hundred_columns(files, capsys):
+    model, path, _ = files
+    assert run(["predict", model, path]) == 0
+    assert run(["predict", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "error to target" in text and "flagged" in text and "Example:" in text
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_a_model_too_large_for_a_slot_is_one_line():
+    class Large:
+        channels, image, crc = 6, bytes(4000), 0
+
+    with pytest.raises(ModelError, match="4000 bytes does not fit the target's slot of 3072") as caught:
+        predict(Large(), random_features(3), "nano")
+    assert "\n" not in str(caught.value) and "vectors" in caught.value.remedy
+
+
+def test_a_file_of_fewer_channels_than_the_model_is_refused():
+    with pytest.raises(ModelError, match="the model has 6 channels, the features 5"):
+        predict(random_model(4), random_features(5)[:, :5])
+
+
+def test_a_recording_without_a_valid_row_is_refused(tmp_path):
+    Recording(np.arange(3), random_features(3), np.zeros((3, 2)), np.zeros(3)).write(tmp_path / "r.csv")
+    with pytest.raises(RecordingError, match="no valid row"):
+        module.read_rows(tmp_path / "r.csv")
+
+
+def test_nan_in_the_features_names_its_line(tmp_path):
+    (tmp_path / "f.csv").write_text("s0,s1\n1,2\n3,nan\n")
+    with pytest.raises(RecordingError, match="line 3, column s1"):
+        module.read_rows(tmp_path / "f.csv")
