@@ -18,6 +18,9 @@ SDK := host_sdk/sparsegaze
 HEX := $(SDK)/data/firmware.hex
 PIO := .pio/build/nano
 BINUTILS := .pio-offline/packages/toolchain-atmelavr/bin
+M4 := firmware/ports/mps2an386
+M4_CC := arm-none-eabi-gcc
+M4_FLAGS := -mcpu=cortex-m4 -mthumb -std=gnu11 -O2 -Wall -Wextra -Werror -ffreestanding -ffunction-sections
 STARTED := $(shell date +%s.%N)
 FRESH := $(if $(wildcard .venv/setup-stamp),,--fresh)
 
@@ -35,13 +38,21 @@ help: ## this list
 setup: ## install what is missing: Debian packages (when root or sudo), .venv with pinned packages
 	@sh tools/setup.sh
 
-firmware: setup ## build the Nano's firmware, check its link, put the hex into the Python package
+firmware: setup build/firmware/cortex-m4.elf ## build the firmware for the Nano and for QEMU's Cortex-M4, check the links, put the Nano's hex into the Python package
 	@$(PY) tools/pio_offline.py run -s -e nano
 	@$(PY) tools/check_link.py $(PIO)/firmware.elf
 	@mkdir -p build/firmware $(dir $(HEX))
 	@$(call refresh,$(PIO)/firmware.elf,build/firmware/firmware.elf)
 	@$(call refresh,$(PIO)/firmware.hex,build/firmware/firmware.hex)
 	@$(call refresh,$(PIO)/firmware.hex,$(HEX),echo "$(HEX) changed: commit it together with the sources")
+
+# No C library: what is linked is what is in firmware/.
+build/firmware/cortex-m4.elf: $(wildcard firmware/core/*.[ch] firmware/app/*.[ch] $(M4)/* $(M4)/include/*) Makefile
+	@mkdir -p $(dir $@)
+	@$(M4_CC) $(M4_FLAGS) -nostdinc -isystem "$$($(M4_CC) -print-file-name=include)" $(addprefix -I,$(M4)/include \
+	    firmware/core firmware/app $(M4)) -nostdlib -T $(M4)/port.ld -Wl,--gc-sections,--fatal-warnings \
+	    $(filter %.c,$^) -o $@.new
+	@$(PY) tools/check_link.py $@.new && mv $@.new $@
 
 native: setup build/native/core build/native/sim ## build what runs here: core, simulator, virtual Nano
 	@$(MAKE) -s --no-print-directory -C tools/vheadset

@@ -37,6 +37,8 @@ missing_packages() {
         has_header simavr/sim_avr.h || echo libsimavr-dev      # virtual Nano: the AVR
         has_header libelf.h || echo libelf-dev                 # virtual Nano: reads the firmware's ELF
         has_header embree3/rtcore.h || echo libembree-dev      # simulator: rays against face and lids
+        command -v arm-none-eabi-gcc >/dev/null || echo gcc-arm-none-eabi   # the firmware on a Cortex-M4
+        command -v qemu-system-arm >/dev/null || echo qemu-system-arm       # predict --on cortex-m4: runs it
         [ -e "$optiboot" ] || echo arduino-core-avr            # virtual Nano: the stock bootloaders
     else
         command -v avrdude >/dev/null || echo avrdude          # a test flashes with it too
@@ -87,6 +89,8 @@ fill_venv() {
     "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
         die "$python is $("$python" -V): Python 3.11 or later is needed: make setup PYTHON=python3.11"
     if ! venv_usable; then
+        # venv --clear empties what a link leads to: another tree's environment.
+        [ ! -L $venv ] || die "$venv is a link to $(readlink $venv), which was not made here: remove the link"
         say "making $venv with $("$python" -V)"
         rm -f $venv/setup-stamp
         "$python" -m venv --clear $venv

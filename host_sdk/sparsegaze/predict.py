@@ -22,6 +22,7 @@ from .errors import ModelError, ProtocolError, RecordingError, VirtualError
 from .exchange import Exchange
 from .flash import FIRMWARE_HEX
 from .metrics import frame_error
+from .qemu import QemuBoard
 from .recording import TARGET_COLUMNS, Recording
 from .virtual import VirtualNano
 from .wire import ffi, lib
@@ -227,9 +228,26 @@ def _on_nano(model, features, progress):
     if len(features) == 0:
         return answers, ()
     if section is None or section.count < len(features):
-        raise ProtocolError("the firmware does not mark what it computes for a request",
-                            "build it anew: make firmware")
+        raise _unmarked()
     return answers, (CYCLES_EXACT, int(section.least), int(section.most))
+
+
+def _on_cortex_m4(model, features, progress):
+    check_room(model, lib.SG_MODEL_SLOT_BYTES)
+    with QemuBoard(model.image) as board, Device(board) as device:
+        check_model(device, model)
+        answers = ask(board, features, progress)
+        taken = board.sections().get(REQUEST_SECTION, ())
+    if len(features) == 0:
+        return answers, ()
+    if len(taken) < len(features):
+        raise _unmarked()
+    return answers, (INSTRUCTIONS, int(min(taken)), int(max(taken)))
+
+
+def _unmarked():
+    return ProtocolError("the firmware does not mark what it computes for a request",
+                         "build it anew: make firmware")
 
 
 def check_room(model, room):
@@ -248,4 +266,4 @@ def check_model(device, model):
                          "fit the recording again, and build the firmware anew: make firmware")
 
 
-TARGETS = {"host": _on_host, "nano": _on_nano}
+TARGETS = {"host": _on_host, "nano": _on_nano, "cortex-m4": _on_cortex_m4}

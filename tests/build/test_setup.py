@@ -71,6 +71,18 @@ def test_changed_requirements_are_noticed(repo_root, traps, bare_tree):
     assert "pip could not install" in done.stderr
 
 
+def test_an_environment_behind_a_link_is_never_cleared(tmp_path, traps, bare_tree):
+    folder, _ = traps
+    theirs = tmp_path / "another-tree" / ".venv"
+    (theirs / "bin").mkdir(parents=True)
+    (theirs / "bin" / "python").write_text("theirs")
+    (bare_tree / ".venv").symlink_to(theirs)
+    done = run_setup(bare_tree, folder)
+    assert done.returncode == 1
+    assert f"setup: .venv is a link to {theirs}" in done.stderr and len(done.stderr.splitlines()) == 1
+    assert (theirs / "bin" / "python").read_text() == "theirs"
+
+
 def test_without_root_the_line_to_run_is_printed_and_nothing_is_installed(traps, bare_tree):
     folder, trace = traps
     fake(folder, "id", "echo 1000")

@@ -29,7 +29,7 @@ def test_every_port_implements_exactly_the_contract(repo_root):
     down = contract.read_text().split("// Down-calls", 1)[1].split("// Up-calls", 1)[0]
     wanted = set(re.findall(r"^[a-z].*?\b(hal_\w+)\(", down, re.M))
     assert 8 <= len(wanted) <= 16
-    for port in ("template", "avr328p"):
+    for port in ("template", "avr328p", "mps2an386"):
         text = "\n".join(path.read_text() for path in sorted((firmware / "ports" / port).glob("*.c")))
         found = re.findall(r"^(?!static)[a-z][^;\n=]*?\b(hal_\w+)\([^;{]*\)\s*\{", text, re.M)
         assert set(found) == wanted, port

@@ -8,13 +8,15 @@ import math
 import numpy as np
 import pytest
 
-from conftest import random_features, random_model
+from conftest import costly_model, random_features, random_model
 
 from sparsegaze import predict as module
+from sparsegaze import qemu
 from sparsegaze.cli import run
-from sparsegaze.errors import ModelError, RecordingError
+from sparsegaze.device import Device
+from sparsegaze.errors import DisconnectedError, ModelError, ProtocolError, RecordingError, VirtualError
 from sparsegaze.model import CHANNELS, FLAG_OUT_OF_RANGE, FLAG_VALID
-from sparsegaze.predict import CYCLES_EXACT, predict
+from sparsegaze.predict import CYCLES_EXACT, INSTRUCTIONS, REQUEST_SECTION, predict
 from sparsegaze.recording import Recording
 
 MODELS = {"64 vectors": (64, 6), "one vector, one channel": (1, 1), "three channels": (20, 3),
@@ -76,6 +78,93 @@ def test_the_nano_counts_the_cycles_of_the_requests_alone(board, tmp_path):
     device.infer(inside)
     section = nano.control.markers()["6n"]
     assert (section.least, section.most) == (done.cycles_min, done.cycles_max)
+
+
+def test_the_cortex_m4_counts_instructions_the_same_every_time():
+    model, features = random_model(64), random_features(300)
+    first, again = predict(model, features, "cortex-m4"), predict(model, features, "cortex-m4")
+    assert first.cycle_kind == INSTRUCTIONS
+    assert 64 * 20 < first.cycles_min <= first.cycles_max < 64 * 400
+    assert (first.cycles_min, first.cycles_max) == (again.cycles_min, again.cycles_max)
+
+
+def test_more_vectors_take_more_instructions_by_the_same_number_each():
+    counts = [predict(costly_model([30000] * CHANNELS, n), np.full((1, CHANNELS), 30000), "cortex-m4").cycles_max
+              for n in (1, 2, 33, 64)]
+    each = counts[1] - counts[0]
+    # One pass of the inner loop, give or take a branch or two where a distance is below 0.
+    assert each > 20
+    assert counts[3] - counts[2] == pytest.approx(31 * each, abs=3 * 31)
+
+
+def test_the_cortex_m4_says_in_words_that_it_counts_instructions(files, capsys):
+    model, path, _ = files
+    assert run(["predict", model, path, "--on", "cortex-m4"]) == 0
+    text = capsys.readouterr().out
+    assert "instructions" in text and "cycles" not in text and "at most" in text
+    assert run(["predict", model, path, "--on", "cortex-m4", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["cycle_kind"] == "instructions"
+
+
+def test_qemu_missing_is_one_line_with_its_remedy(files, capsys, monkeypatch):
+    model, path, _ = files
+    monkeypatch.setattr(qemu, "PROGRAM", "qemu-system-of-no-machine")
+    assert run(["predict", model, path, "--on", "cortex-m4"]) == 1
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "not installed" in said and "apt-get install qemu-system-arm; make firmware" in said
+
+
+def test_the_image_missing_is_one_line_with_its_remedy(tmp_path):
+    with pytest.raises(VirtualError, match="not built") as caught:
+        qemu.QemuBoard(program=tmp_path / "no.elf")
+    assert "make firmware" in caught.value.remedy
+
+
+def test_an_image_that_is_no_program_is_told_by_qemus_own_words(tmp_path):
+    (tmp_path / "bad.elf").write_bytes(b"no program")
+    with qemu.QemuBoard(program=tmp_path / "bad.elf") as board:
+        with pytest.raises(DisconnectedError, match="the Cortex-M4 in QEMU is gone"):
+            Device(board)
+
+
+def test_a_damaged_model_is_refused_by_the_cortex_m4_itself():
+    image = bytearray(random_model(20).image)
+    image[-1] ^= 1
+    with qemu.QemuBoard(bytes(image)) as board, Device(board) as device:
+        with pytest.raises(ModelError, match="a checksum does not match"):
+            module.check_model(device, random_model(20))
+
+
+def test_a_board_without_a_model_flags_every_answer():
+    with qemu.QemuBoard() as board, Device(board) as device:
+        assert (device.infer(random_features(5)).flags == 2).all()
+
+
+def test_noise_on_the_line_of_the_cortex_m4_harms_nothing():
+    noise = np.random.default_rng(0).integers(0, 256, 5000, np.uint8).tobytes()
+    model, features = random_model(20), random_features(20)
+    with qemu.QemuBoard(model.image) as board, Device(board) as device:
+        board.write(noise)
+        board.write(b"\0")
+        assert device.status().rx_bad > 0
+        assert device.infer(features).azimuth_deg.tolist() == predict(model, features).azimuth_deg.tolist()
+        assert device.status().stack_free > 4000
+
+
+def test_a_reboot_ends_qemu_and_is_noticed():
+    with qemu.QemuBoard() as board, Device(board) as device:
+        with pytest.raises(DisconnectedError, match="the program in it ended"):
+            device.reboot()
+
+
+def test_a_record_with_a_part_missing_is_refused(tmp_path):
+    with qemu.QemuBoard(random_model(4).image) as board, Device(board) as device:
+        device.infer(random_features(3))
+        assert len(board.sections()[REQUEST_SECTION]) >= 3
+        whole = board._scope.read_bytes()
+        board._scope.write_bytes(whole[:8] + whole[16:])
+        with pytest.raises(ProtocolError, match="damaged"):
+            board.sections()
 
 
 @pytest.fixture

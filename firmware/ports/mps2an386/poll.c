@@ -1,0 +1,87 @@
+// SPDX-License-Identifier: Apache-2.0
+// The main loop's turn, and the rest of the contract: no sensors, so no frame ever comes; no store, so the live
+// state lasts until the next reset.
+#include "port.h"
+
+enum { IDLE_TURNS = 1000 };             // turns without a byte before the sleep: checks of models go on in them
+
+static uint16_t idle;
+static uint32_t now_us;
+static uint32_t seen_ticks;
+
+void hal_boot(void)
+{
+}
+
+void hal_describe(struct sg_hello *hello)
+{
+    hello->slot_bytes = SLOT_BYTES;
+    hello->slot_base[0] = SLOT_A;
+    hello->slot_base[1] = SLOT_B;
+    hello->cpu_hz = TICKS_PER_US * 1000000UL;
+    hello->frame_period_us = 3840;
+    hello->exposure_min_us = 16;
+    hello->exposure_max_us = 304;
+    hello->page_bytes = 0;
+    hello->board = SG_BOARD_TEMPLATE;
+}
+
+const uint8_t *hal_slot(uint8_t slot)
+{
+    if (slot > SG_SLOT_B)
+        return 0;
+    return (const uint8_t *)(slot == SG_SLOT_A ? (uintptr_t)SLOT_A : (uintptr_t)SLOT_B);
+}
+
+void hal_start(const uint16_t exposure_cycles[HAL_CHANNELS])
+{
+    (void)exposure_cycles;
+    scope_start();
+    serial_start();
+}
+
+uint32_t hal_now_us(void)
+{
+    while (scope_now() - seen_ticks >= TICKS_PER_US * 1000U) {
+        seen_ticks += TICKS_PER_US * 1000U;
+        now_us += 1000;
+    }
+    return now_us + (scope_now() - seen_ticks) / TICKS_PER_US;
+}
+
+int hal_poll(void)
+{
+    if (serial_poll())
+        idle = 0;
+    else if (idle < IDLE_TURNS)
+        idle++;
+    else
+        serial_sleep();
+    return 1;
+}
+
+void hal_expose(const uint16_t exposure_cycles[HAL_CHANNELS])
+{
+    (void)exposure_cycles;
+}
+
+uint8_t hal_load(void *record, uint8_t n)
+{
+    (void)record;
+    (void)n;
+    return 0;
+}
+
+uint8_t hal_save(const void *record, uint8_t n)
+{
+    (void)record;
+    (void)n;
+    return 1;
+}
+
+void hal_report(struct sg_status *status)
+{
+    status->rx_overrun = serial_overruns();
+    status->stack_free = boot_stack_free();
+    status->reset_cause = SG_RESET_POWER;
+}
