@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Write the constant tables of the core: sg_gp_table.c, sg_expose_table.h, sg_crc32_table.h.
+"""Write the constant tables of the core: sg_gp_table.c, sg_mlp_table.c, sg_expose_table.h, sg_crc32_table.h.
 
     python3 firmware/core/make_tables.py            write them beside this script
     python3 firmware/core/make_tables.py --check    exit 1 if a committed file differs
@@ -84,6 +84,25 @@ def gp_table():
             "const uint16_t sg_gp_exp_table[2048] SG_ROM = {\n" + rows(values) + "};\n")
 
 
+def tanh_table():
+    """[level Q0.15] of tanh(i ln 2 / 32), i = 0..256.
+
+    The chord lies below the curve: half of its greatest height, second derivative * step^2 / 8, goes onto the
+    nodes."""
+    step = math.log(2.0) / 32
+    values = []
+    for i in range(257):
+        t = math.tanh(i * step)
+        values.append(min(rounded(32768 * (t + t * (1 - t * t) * step * step / 8)), 32767))
+    return values
+
+
+def mlp_table():
+    """Text of sg_mlp_table.c."""
+    return (LICENSE + MADE_BY + '#include "sg_mlp_loop.h"\n#include "sg_rom.h"\n\n'
+            "const uint16_t sg_mlp_tanh_table[257] SG_ROM = {\n" + rows(tanh_table()) + "};\n")
+
+
 def capacitance_log2():
     """log2 of the mean capacitance over a drop of 16*i codes (64*i quarters), with every constant of the feature, Q4.12."""
     per_quarter_v = SUPPLY_V / CODES_Q2
@@ -131,7 +150,8 @@ def main(argv):
     """Write or check; returns the exit code."""
     here = os.path.dirname(os.path.abspath(__file__))
     stale = []
-    tables = {"sg_gp_table.c": gp_table, "sg_expose_table.h": expose_table, "sg_crc32_table.h": crc32_table}
+    tables = {"sg_gp_table.c": gp_table, "sg_mlp_table.c": mlp_table, "sg_expose_table.h": expose_table,
+              "sg_crc32_table.h": crc32_table}
     for name, make in tables.items():
         text = make()
         path = os.path.join(here, name)

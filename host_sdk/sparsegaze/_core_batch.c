@@ -5,6 +5,7 @@
 
 #include "sg_err.h"
 #include "sg_expose.h"
+#include "sg_mlp.h"
 #include "sg_track.h"
 
 // cdef begin
@@ -16,6 +17,10 @@ int sg_batch_infer(const struct sg_model_view *view, const uint16_t *features, c
 // sg_expose_feature over n readings. flags[n] or NULL.
 void sg_batch_feature(const uint16_t *code_q2, const uint16_t *exposure_cycles, uint16_t *feature,
                       uint8_t *flags, size_t n);
+
+// sg_mlp_predict over n points. inputs[n * view->inputs]; outputs[n * view->outputs]; flags[n].
+void sg_batch_mlp(const struct sg_mlp_view *view, const uint16_t *inputs, int16_t *outputs, uint8_t *flags,
+                  size_t n);
 // cdef end
 
 int sg_batch_infer(const struct sg_model_view *view, const uint16_t *features, const uint8_t *raw_flags,
@@ -40,4 +45,12 @@ void sg_batch_feature(const uint16_t *code_q2, const uint16_t *exposure_cycles, 
         if (flags != NULL)
             flags[i] = seen;
     }
+}
+
+void sg_batch_mlp(const struct sg_mlp_view *view, const uint16_t *inputs, int16_t *outputs, uint8_t *flags,
+                  size_t n)
+{
+    uint16_t scratch[SG_MLP_SCRATCH_MAX];
+    for (size_t i = 0; i < n; i++)
+        sg_mlp_predict(view, inputs + i * view->inputs, scratch, outputs + i * view->outputs, flags + i);
 }
