@@ -32,7 +32,7 @@ ICOUNT_SHIFT = 10               # 2^10 ns of QEMU's clock pass with every instru
 TICK_NS = 40
 SCOPE = np.dtype([("mark", "u1"), ("section", "u1"), ("number", "<u2"), ("ticks", "<u4")])
 SCOPE_MARK = 0xA5
-SECTION_EMPTY = 7
+SECTION_EMPTY = 15
 
 
 class QemuBoard:
@@ -61,9 +61,8 @@ class QemuBoard:
         self._scope, self._errors = folder / "scope", folder / "errors"
         # A copy: QEMU reads commas and other characters of a path in its own way.
         shutil.copyfile(program, folder / "elf")
-        command = [qemu, "-M", "mps2-an386", "-display", "none", "-monitor", "none", "-no-reboot",
-                   "-icount", f"shift={ICOUNT_SHIFT},align=off,sleep=on", "-kernel", "elf",
-                   "-chardev", "stdio,id=line,signal=off", "-serial", "chardev:line", "-serial", "file:scope"]
+        command = machine(qemu, "elf") + ["-chardev", "stdio,id=line,signal=off", "-serial", "chardev:line",
+                                          "-serial", "file:scope"]
         if image is not None:
             (folder / "model").write_bytes(image)
             command += ["-device", f"loader,file=model,addr={SLOT_A},force-raw=on"]
@@ -91,24 +90,8 @@ class QemuBoard:
         self._finalizer()
 
     def sections(self):
-        """{section: int64 [k]} instructions of every run of a marked section, in order, the marking taken off.
-
-        Sections are those of enum hal_section. Raises ProtocolError when the record is not whole.
-        """
-        data = self._scope.read_bytes()
-        records = np.frombuffer(data, SCOPE, len(data) // SCOPE.itemsize)
-        whole = (records["mark"] == SCOPE_MARK).all() and len(data) % SCOPE.itemsize == 0
-        if not whole or not np.array_equal(records["number"], np.arange(len(records)) % 65536):
-            raise ProtocolError("the Cortex-M4's record of its sections is damaged",
-                                "build it anew: make firmware")
-        empty = records["ticks"][records["section"] == SECTION_EMPTY]
-        if not len(empty):
-            raise ProtocolError("the Cortex-M4 has not begun its record", "build it anew: make firmware")
-        # Readings are whole ticks and an instruction takes 25.6 of them: rounding gives its number exactly.
-        net = (records["ticks"].astype(np.int64) - int(empty[0])) * TICK_NS
-        instructions = (net + (1 << ICOUNT_SHIFT - 1)) >> ICOUNT_SHIFT
-        return {int(section): instructions[records["section"] == section]
-                for section in np.unique(records["section"])}
+        """section_counts() of all that was marked so far."""
+        return section_counts(self._scope.read_bytes())
 
     # the link -----------------------------------------------------------------------------------------------
 
@@ -154,6 +137,33 @@ class QemuBoard:
         reason = said[0] if said else "the program in it ended"
         return DisconnectedError(f"{self.port} is gone ({reason})",
                                  "apt-get install qemu-system-arm; make firmware")
+
+
+def machine(qemu, program):
+    """The command line of a board whose two serial lines are yet to be given; QEMU's path, the ELF's."""
+    return [qemu, "-M", "mps2-an386", "-display", "none", "-monitor", "none", "-no-reboot", "-icount",
+            f"shift={ICOUNT_SHIFT},align=off,sleep=on", "-kernel", program]
+
+
+def section_counts(data):
+    """What the port's scope wrote -> {section: int64 [k]}: instructions of every run of a section, in order.
+
+    Sections are those of enum hal_section; the instructions of the marking are taken off.
+    Raises ProtocolError when the record is not whole.
+    """
+    records = np.frombuffer(data, SCOPE, len(data) // SCOPE.itemsize)
+    whole = (records["mark"] == SCOPE_MARK).all() and len(data) % SCOPE.itemsize == 0
+    if not whole or not np.array_equal(records["number"], np.arange(len(records)) % 65536):
+        raise ProtocolError("the Cortex-M4's record of its sections is damaged",
+                            "build it anew: make firmware")
+    empty = records["ticks"][records["section"] == SECTION_EMPTY]
+    if not len(empty):
+        raise ProtocolError("the Cortex-M4 has not begun its record", "build it anew: make firmware")
+    # Readings are whole ticks and an instruction takes 25.6 of them: rounding gives its number exactly.
+    net = (records["ticks"].astype(np.int64) - int(empty[0])) * TICK_NS
+    instructions = (net + (1 << ICOUNT_SHIFT - 1)) >> ICOUNT_SHIFT
+    return {int(section): instructions[records["section"] == section]
+            for section in np.unique(records["section"])}
 
 
 def _end(process, folder):

@@ -20,8 +20,8 @@ enum hal_section {
     HAL_SECTION_SERIAL = 4,
     HAL_SECTION_FRAME = 5,
     HAL_SECTION_REQUEST = 6,    // sg_track_infer for SG_MSG_INFER
-    HAL_SECTION_EMPTY = 7,      // what the marking itself costs
-    HAL_SECTIONS = 8,
+    HAL_SECTION_EMPTY = 15,     // what the marking itself costs
+    HAL_SECTIONS = 16,
 };
 
 // scope.c. Out of line and never inlined, so that every section pays the same for being marked.

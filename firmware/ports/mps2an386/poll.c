@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// The main loop's turn, and the rest of the contract: no sensors, so no frame ever comes; no store, so the live
-// state lasts until the next reset.
+// The main loop's turn, and the rest of the contract: no sensors, so no frame ever comes; no store, so the
+// live state lasts until the next reset.
 #include "port.h"
 
-enum { IDLE_TURNS = 1000 };             // turns without a byte before the sleep: checks of models go on in them
+// Turns without a byte before the sleep: checks of models go on in them.
+enum { IDLE_TURNS = 1000 };
 
 static uint16_t idle;
 static uint32_t now_us;

@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// Between the source files of this port: a board of QEMU (mps2-an386: Cortex-M4, two UARTs, a timer) that has no
-// sensors and computes what it is asked. One noun each: boot, scope, serial, memory, and poll, which joins them.
+// Between the source files of this port: a board of QEMU (mps2-an386: Cortex-M4, two UARTs, a timer) that has
+// no sensors and computes what it is asked. One noun each: boot, scope, serial, memory, and poll, which joins
+// them.
 //
-// QEMU runs it with -icount shift=10: its clock is the number of instructions, 1024 ns each, and nothing else.
+// QEMU runs it with -icount shift=10: its clock is the number of instructions, 1024 ns each, and nothing
+// else.
 #ifndef PORT_H
 #define PORT_H
 
@@ -67,8 +69,8 @@ uint32_t scope_now(void);           // ticks since boot
 
 // serial.c
 void serial_start(void);
-uint8_t serial_poll(void);          // moves bytes both ways, acts once the line has drained; 0: nothing to do
-void serial_sleep(void);            // until a byte arrives or a SysTick round ends; restarts after QUIET_LIMIT
+uint8_t serial_poll(void);          // moves bytes both ways, acts once the line has drained; 0: idle
+void serial_sleep(void);            // until a byte or the end of a SysTick round; acts on QUIET_LIMIT
 uint16_t serial_overruns(void);
 
 #endif

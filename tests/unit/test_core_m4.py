@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The core on a Cortex-M4: the same bits as on the host, function by function, and a counter that counts."""
+import zlib
+
+import numpy as np
+import pytest
+
+import core_m4_harness as m4
+from core_models import random_parts
+from sparsegaze._core import ffi, lib
+from test_core_avr import READINGS, gaze_bytes
+from test_core_gp import GOLDEN_CRC, golden_case
+
+INFER = "sg_track_infer(&view, (const uint16_t *)in, 0, recentre, (struct sg_gaze *)out);"
+OPEN = ("struct sg_model_view view; const int16_t recentre[2] = { 0, 0 };"
+        "if (sg_model_open(&view, image, sizeof image, 0) != SG_OK) return 1;")
+
+
+def infer(directory, parts, feature, wrap=None):
+    """sg_track_infer over the features on the Cortex-M4."""
+    return m4.run_cases(directory, INFER, feature, ffi.sizeof("struct sg_gaze"), ["sg_track.h", "sg_err.h"],
+                        OPEN, {"image": parts.image()}, wrap)
+
+
+def test_golden_vectors_are_bit_identical(tmp_path):
+    parts, feature = golden_case()
+    output = infer(tmp_path, parts, feature).output.tobytes()
+    crc = zlib.crc32(output)
+    print(f"golden CRC-32 over 64 predictions, Cortex-M4: {crc:08x}")
+    assert output == gaze_bytes(parts, feature) and crc == GOLDEN_CRC
+
+
+@pytest.mark.parametrize("d,n", [(1, 1), (3, 48), (6, 200)])
+def test_random_models_are_bit_identical(tmp_path, d, n):
+    rng = np.random.default_rng(10 * d + n)
+    parts = random_parts(rng, n, d, guards=n % 9)
+    feature = rng.integers(0, 65536, (200, 6)).astype(np.uint16)
+    assert infer(tmp_path, parts, feature).output.tobytes() == gaze_bytes(parts, feature)
+
+
+def test_features_from_codes_and_exposures_are_bit_identical(tmp_path):
+    rows = np.array([code + cycles for code, cycles in READINGS], np.uint16)
+    result = m4.run_cases(tmp_path, "((uint8_t *)out)[12] = sg_track_features((const uint16_t *)in, "
+                          "(const uint16_t *)in + 6, (uint16_t *)out);", rows, 13, ["sg_track.h"])
+    for (code, cycles), out in zip(READINGS, result.output):
+        feature = ffi.new("uint16_t[6]")
+        flags = lib.sg_track_features(code, cycles, feature)
+        assert out.tobytes() == bytes(ffi.buffer(feature)) + bytes([flags])
+
+
+def test_the_counter_counts_every_instruction(tmp_path):
+    # A loop of three instructions, n times; what stands round it costs the same for every n > 0.
+    loop = ('uint32_t k = *(const uint32_t *)in;'
+            '__asm__ volatile("1: nop\\n subs %0, #1\\n bne 1b" : "+r"(k));')
+    n = np.array([[1], [2], [3], [1000], [100000]], np.uint32)
+    counted = m4.run_cases(tmp_path, loop, n, 1).instructions
+    assert ((counted - counted[0]) == 3 * (n[:, 0].astype(np.int64) - 1)).all()
+    assert 3 <= counted[0] <= 10
+
+
+def test_a_wrapped_function_is_counted_without_its_caller(tmp_path):
+    n = np.array([[0], [1], [2], [10]], np.uint32)
+    data = bytes(range(16))
+    result = m4.run_cases(tmp_path, "*(uint16_t *)out = sg_wire_crc16(0xFFFF, bytes, *(const uint32_t *)in);",
+                          n, 2, ["sg_wire.h"], data={"bytes": data}, wrap="sg_wire_crc16")
+    expected = [lib.sg_wire_crc16(0xFFFF, data[:k], k) for k in n[:, 0].tolist()]
+    assert result.output.view(np.uint16)[:, 0].tolist() == expected
+    assert 1 <= result.function[0] < 10 and (np.diff(result.function) > 0).all()
+
+
+def test_a_wrong_instruction_in_the_core_would_be_seen(tmp_path):
+    parts, feature = golden_case()
+    wrong = m4.run_cases(tmp_path, INFER + " out[4] ^= i == 63;", feature, 12, ["sg_track.h", "sg_err.h"],
+                         OPEN, {"image": parts.image()})
+    assert zlib.crc32(wrong.output.tobytes()) != GOLDEN_CRC
+
+
+def test_a_program_that_faults_is_an_error_and_no_hang(tmp_path):
+    with pytest.raises(AssertionError, match="wrote 0 bytes"):
+        m4.run_cases(tmp_path, '__asm__ volatile("udf #0");', np.zeros((3, 1), np.uint8), 1)
