@@ -60,8 +60,8 @@ void app_models_step(void);                                 // one piece of a ch
 void app_live_start(void);                                  // load, count the boot
 uint16_t app_live_boots(void);
 void app_live_exposures(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t *automatic);     // as stored
-const int16_t *app_recentre(void);                          // in force for the model in use
-void app_recentre_set(int16_t az_deg_q7, int16_t el_deg_q7);
+const struct sg_affine *app_recentre(void);                 // in force for the model in use
+void app_recentre_set(const struct sg_affine *affine);
 void app_live_keep_exposures(void);                         // store them as they are now
 void app_live_frame(void);                                  // once per frame: notice exposures that moved
 void app_live_step(void);

@@ -125,14 +125,12 @@ static int8_t recentre(struct sg_recentre *io)
     if (io->op > SG_RECENTRE_CLEAR)
         return SG_E_ARG;
     if (io->op == SG_RECENTRE_SET && !app_model())
-        return SG_E_STATE;              // an offset belongs to a model
+        return SG_E_STATE;              // a correction belongs to a model
     if (io->op == SG_RECENTRE_SET)
-        app_recentre_set(io->az_deg_q7, io->el_deg_q7);
+        app_recentre_set(&io->affine);
     else if (io->op == SG_RECENTRE_CLEAR)
-        app_recentre_set(0, 0);
-    const int16_t *now = app_recentre();
-    io->az_deg_q7 = now[0];
-    io->el_deg_q7 = now[1];
+        app_recentre_set(NULL);
+    io->affine = *app_recentre();
     io->reserved = 0;
     return SG_OK;
 }
@@ -143,7 +141,7 @@ static void infer(void)
     memcpy(feature, body.infer.feature, sizeof feature);
     const uint8_t flags = app_model_slot() == SG_SLOT_RAM ? SG_FLAG_TRIAL : 0;
     const struct sg_model_view *model = app_model();
-    const int16_t *recentre = app_recentre();
+    const struct sg_affine *recentre = app_recentre();
     HAL_BEGIN(HAL_SECTION_REQUEST);
     sg_track_infer(model, feature, flags, recentre, &body.gaze);
     HAL_END(HAL_SECTION_REQUEST);

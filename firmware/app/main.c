@@ -109,7 +109,7 @@ static void stream(const struct hal_frame *frame, union streamed *out, const str
 void app_on_frame(const struct hal_frame *frame)
 {
     const struct sg_model_view *model = app_model();
-    const int16_t *recentre = app_recentre();
+    const struct sg_affine *recentre = app_recentre();
     union streamed out = { .raw = { .t_us = frame->t_us, .span_us = frame->span_us } };
     struct sg_gaze gaze;
 
@@ -125,8 +125,7 @@ void app_on_frame(const struct hal_frame *frame)
     }
     out.raw.flags = flags;
     out.raw.model_crc = model ? model->crc : 0;
-    out.raw.recentre_az_deg_q7 = recentre[0];
-    out.raw.recentre_el_deg_q7 = recentre[1];
+    out.raw.recentre = *recentre;
 
     HAL_BEGIN(HAL_SECTION_INFER);
     sg_track_infer(model, out.raw.feature, flags, recentre, &gaze);

@@ -19,8 +19,38 @@ uint8_t sg_track_features(const uint16_t code_q2[6], const uint16_t exposure_cyc
     return flags;
 }
 
+// One row of G g, Q7, rounded: at most 2^14. Q9 times Q7 is Q16, high and low byte of the angle apart, as the AVR
+// multiplies: floor((256 a + b) / 512) is floor((a + floor(b / 256)) / 2).
+static int16_t gained(const int8_t row_q9[2], const int16_t deg_q7[2])
+{
+    int32_t high_q8 = 0, low_q16 = 256;
+    for (uint8_t i = 0; i < 2; i++) {
+        high_q8 += (int16_t)(row_q9[i] * (int8_t)(deg_q7[i] >> 8));
+        low_q16 += (int16_t)(row_q9[i] * (uint8_t)deg_q7[i]);
+    }
+    return (int16_t)((high_q8 + (low_q16 >> 8)) >> 1);
+}
+
+// In place. Returns 0 if an angle saturated.
+static uint8_t correct(const struct sg_affine *affine, int16_t deg_q7[2])
+{
+    int16_t more_q7[2] = { 0, 0 };
+    uint8_t whole = 1;
+    // Most devices have no gain.
+    if (affine->gain_q9[0] | affine->gain_q9[1] | affine->gain_q9[2] | affine->gain_q9[3]) {
+        more_q7[0] = gained(affine->gain_q9, deg_q7);
+        more_q7[1] = gained(affine->gain_q9 + 2, deg_q7);
+    }
+    for (uint8_t i = 0; i < 2; i++) {
+        const int32_t sum = (int32_t)deg_q7[i] + affine->offset_deg_q7[i] + more_q7[i];
+        deg_q7[i] = sg_q_sat16(sum);
+        whole &= deg_q7[i] == sum;
+    }
+    return whole;
+}
+
 int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], uint8_t raw_flags,
-                   const int16_t recentre_deg_q7[2], struct sg_gaze *out)
+                   const struct sg_affine *recentre, struct sg_gaze *out)
 {
     uint8_t flags = raw_flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_EXPOSURE | SG_FLAG_TRIAL
                                  | SG_FLAG_RECOVERING);
@@ -32,12 +62,8 @@ int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], 
     } else {
         uint8_t seen;
         result = sg_gp_predict(view, feature, deg_q7, &seen);
-        for (uint8_t i = 0; i < 2; i++) {
-            const int32_t sum = (int32_t)deg_q7[i] + recentre_deg_q7[i];
-            deg_q7[i] = sg_q_sat16(sum);
-            if (deg_q7[i] != sum)
-                result = SG_E_RANGE;
-        }
+        if (!correct(recentre, deg_q7))
+            result = SG_E_RANGE;
         if (result != SG_OK)
             seen = SG_FLAG_OUT_OF_RANGE;
         flags |= seen;
@@ -49,6 +75,6 @@ int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], 
     out->elevation_deg_q7 = deg_q7[1];
     out->infer_us = 0;
     out->flags = flags;
-    out->reserved = 0;
+    out->sigma_log2_q4 = 0;
     return result;
 }

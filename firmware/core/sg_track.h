@@ -24,13 +24,15 @@ uint8_t sg_track_features(const uint16_t code_q2[6], const uint16_t exposure_cyc
 //   feature           6 features, 1/4096 octave
 //   raw_flags         of the sg_raw the features come from; SATURATED, STARVED, EXPOSURE, TRIAL and RECOVERING
 //                     are passed on
-//   recentre_deg_q7   added to the model's output (azimuth, elevation), 1/128 deg; the sum saturates
-//   out               whole frame; t_us and infer_us are 0: the caller owns the clock
+//   recentre          correction of the model's output g: g + offset + floor(G g / 512 + 1/2), G g and the sum
+//                     exact in 32 bits (|G g| <= 2^23), then saturated
+//   out               whole frame; t_us and infer_us are 0: the caller owns the clock. sigma is that of the model's
+//                     output, uncorrected
 // SG_FLAG_VALID is set only when there is a model and none of OUT_OF_RANGE, SATURATED, STARVED, RECOVERING is
 // set.
 // Returns SG_OK, or SG_E_RANGE when an angle saturated (the frame is then OUT_OF_RANGE and not VALID).
 int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], uint8_t raw_flags,
-                   const int16_t recentre_deg_q7[2], struct sg_gaze *out);
+                   const struct sg_affine *recentre, struct sg_gaze *out);
 // cdef end
 
 #endif

@@ -16,7 +16,7 @@
 
 // cdef begin
 enum sg_wire_limits {
-    SG_WIRE_VERSION = 1,
+    SG_WIRE_VERSION = 2,
     SG_WIRE_CHANNELS = 6,       // feature channels in every stream frame; unused ones are 0
     SG_WIRE_HEAD_BYTES = 4,
     SG_WIRE_BODY_MAX = 64,      // largest body, bytes
@@ -68,13 +68,13 @@ enum sg_flag {
 enum sg_exposure_op { SG_EXPOSURE_GET = 0, SG_EXPOSURE_SET = 1, SG_EXPOSURE_AUTO = 2, SG_EXPOSURE_HOLD = 3 };
 enum sg_recentre_op { SG_RECENTRE_GET = 0, SG_RECENTRE_SET = 1, SG_RECENTRE_CLEAR = 2 };
 enum sg_slot { SG_SLOT_A = 0, SG_SLOT_B = 1, SG_SLOT_RAM = 2, SG_SLOT_NONE = 255 };
-enum sg_board { SG_BOARD_TEMPLATE = 0, SG_BOARD_NANO328P = 1 };
+enum sg_board { SG_BOARD_TEMPLATE = 0, SG_BOARD_NANO328P = 1, SG_BOARD_MPS2AN386 = 2 };
 enum sg_reset { SG_RESET_POWER = 1, SG_RESET_EXTERNAL = 2, SG_RESET_BROWNOUT = 4, SG_RESET_WATCHDOG = 8 };
 
 struct sg_head {
     uint16_t seq;
     uint8_t type;               // enum sg_msg
-    uint8_t flags;              // 0 in version 1; ignored by receivers
+    uint8_t flags;              // 0 in version 2; ignored by receivers
 };
 
 struct sg_hello {
@@ -126,21 +126,27 @@ struct sg_mode { uint8_t mode; };
 
 struct sg_infer { uint16_t feature[6]; };
 
+// Correction of a model's output g = (azimuth, elevation):  gaze = g + offset + G g.  Every value is legal: the
+// entries of G are at least -1/4 and below it, so that no correction folds the picture or turns it over.
+struct sg_affine {
+    int16_t offset_deg_q7[2];   // azimuth, elevation
+    int8_t gain_q9[4];          // G row by row: azimuth from azimuth, from elevation, elevation from each
+};
+
 struct sg_gaze {
     uint32_t t_us;              // mean sample time of the frame, device time
-    int16_t azimuth_deg_q7;     // Fick azimuth, + right, 1/128 deg, recentre offset included
+    int16_t azimuth_deg_q7;     // Fick azimuth, + right, 1/128 deg, recentre correction included
     int16_t elevation_deg_q7;   // Fick elevation, + up
     uint16_t infer_us;          // last sample to the end of inference, device time; 0 in replies to SG_MSG_INFER
     uint8_t flags;              // bits of enum sg_flag
-    uint8_t reserved;
+    uint8_t sigma_log2_q4;      // standard deviation of the model's output: 2^(code / 16 - 8) deg; 0 unknown, 255 or more
 };
 
 // Everything the gaze of the same seq depends on.
 struct sg_raw {
     uint32_t t_us;              // mean sample time of the frame
     uint32_t model_crc;         // CRC-32 of the model in use, 0 without one
-    int16_t recentre_az_deg_q7;
-    int16_t recentre_el_deg_q7;
+    struct sg_affine recentre;  // in force
     uint16_t feature[6];        // log2 photocurrent, 1/4096 octave (sg_expose.h)
     uint16_t span_us;           // mean sample time to last sample, device time
     uint8_t flags;              // SATURATED, STARVED, EXPOSURE, TRIAL, RECOVERING, as in the gaze frame
@@ -190,8 +196,7 @@ struct sg_exposure {
 };
 
 struct sg_recentre {
-    int16_t az_deg_q7;          // added to the model's output
-    int16_t el_deg_q7;
+    struct sg_affine affine;    // of the model in use
     uint8_t op;                 // enum sg_recentre_op
     uint8_t reserved;
 };
@@ -218,15 +223,16 @@ _Static_assert(sizeof(struct sg_hello) == 36, "wire layout");
 _Static_assert(sizeof(struct sg_status) == 48, "wire layout");
 _Static_assert(sizeof(struct sg_pong) == 12, "wire layout");
 _Static_assert(sizeof(struct sg_infer) == 12, "wire layout");
+_Static_assert(sizeof(struct sg_affine) == 8, "wire layout");
 _Static_assert(sizeof(struct sg_gaze) == 12, "wire layout");
-_Static_assert(sizeof(struct sg_raw) == 28, "wire layout");
+_Static_assert(sizeof(struct sg_raw) == 32, "wire layout");
 _Static_assert(sizeof(struct sg_counts) == 28, "wire layout");
 _Static_assert(sizeof(struct sg_model_info) == 36, "wire layout");
 _Static_assert(sizeof(struct sg_model_at) == 4, "wire layout");
 _Static_assert(sizeof(struct sg_model_data) == 52, "wire layout");
 _Static_assert(sizeof(struct sg_model_verdict) == 8, "wire layout");
 _Static_assert(sizeof(struct sg_exposure) == 14, "wire layout");
-_Static_assert(sizeof(struct sg_recentre) == 6, "wire layout");
+_Static_assert(sizeof(struct sg_recentre) == 10, "wire layout");
 _Static_assert(sizeof(struct sg_error) == 2, "wire layout");
 
 #endif

@@ -12,7 +12,7 @@
 // sg_track_infer over n samples. features[n * 6]; raw_flags[n] or NULL for 0; out[n].
 // Returns SG_OK, or SG_E_RANGE if any sample saturated.
 int sg_batch_infer(const struct sg_model_view *view, const uint16_t *features, const uint8_t *raw_flags,
-                   const int16_t recentre_deg_q7[2], struct sg_gaze *out, size_t n);
+                   const struct sg_affine *recentre, struct sg_gaze *out, size_t n);
 
 // sg_expose_feature over n readings. flags[n] or NULL.
 void sg_batch_feature(const uint16_t *code_q2, const uint16_t *exposure_cycles, uint16_t *feature,
@@ -24,13 +24,13 @@ void sg_batch_mlp(const struct sg_mlp_view *view, const uint16_t *inputs, int16_
 // cdef end
 
 int sg_batch_infer(const struct sg_model_view *view, const uint16_t *features, const uint8_t *raw_flags,
-                   const int16_t recentre_deg_q7[2], struct sg_gaze *out, size_t n)
+                   const struct sg_affine *recentre, struct sg_gaze *out, size_t n)
 {
     int worst = SG_OK;
     for (size_t i = 0; i < n; i++) {
         const uint8_t flags = raw_flags == NULL ? 0 : raw_flags[i];
         const uint16_t *feature = features + i * SG_MODEL_CHANNELS;
-        const int result = sg_track_infer(view, feature, flags, recentre_deg_q7, out + i);
+        const int result = sg_track_infer(view, feature, flags, recentre, out + i);
         if (result != SG_OK)
             worst = result;
     }

@@ -280,6 +280,7 @@ def info(port, as_json):
         "exposure_us": list(exposure.exposure_us),
         "exposure_automatic": exposure.automatic,
         "recentre_deg": [recentre.azimuth_deg, recentre.elevation_deg],
+        "recentre_gain": recentre.affine.gain,
         "models": slots,
         "ping_ms": clock.round_trip_s * 1e3 if clock.round_trip_s is not None else None,
     }
@@ -296,7 +297,12 @@ def info(port, as_json):
                 " ".join(f"{v:.2f}" for v in exposure.exposure_us) + f" us ({hello.exposure_min_us}.."
                 f"{hello.exposure_max_us}, {'automatic' if exposure.automatic else 'held'})",
             ),
-            ("recentre", f"{recentre.azimuth_deg:+.2f} {recentre.elevation_deg:+.2f} deg"),
+            (
+                "recentre",
+                f"{recentre.azimuth_deg:+.2f} {recentre.elevation_deg:+.2f} deg, gain "
+                + " ".join(f"{100 * v:+.1f}" for row in recentre.affine.gain for v in row)
+                + " %",
+            ),
             ("boots", f"{status.boot_count}, last by {status.reset_text}"),
             ("free stack", f"{status.stack_free} bytes"),
             (

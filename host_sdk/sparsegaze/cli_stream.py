@@ -27,7 +27,7 @@ def stream(port, seconds, csv, as_json):
 
     A terminal shows one line: gaze in degrees (azimuth + right, elevation + up), rate in device time, lost
     frames. CSV columns: t_us, host_time_s, seq, azimuth_deg, elevation_deg, flags, s0..s5, recentre_az_deg,
-    recentre_el_deg. A gaze whose flags lack bit 0 (valid) is no gaze: a blink, or a headset that moved.
+    recentre_el_deg, recentre_az_az .. el_el (the correction in force), sigma_deg. A gaze whose flags lack bit 0 (valid) is no gaze: a blink, or a headset that moved.
 
     \b
     Example:

@@ -44,6 +44,7 @@ class Inference(NamedTuple):
     azimuth_deg: np.ndarray     # [n] float64, exact multiples of 1/128
     elevation_deg: np.ndarray
     flags: np.ndarray           # [n] uint8, bits of enum sg_flag
+    sigma_deg: np.ndarray       # [n] float64, standard deviation by the model's own account, NaN: unknown
 
 
 class Device:
@@ -166,17 +167,17 @@ class Device:
             raise ValueError(f"features are [n, {lib.SG_WIRE_CHANNELS}], not {rows.shape}")
         if rows.size and (rows.min() < 0 or rows.max() > 65535):
             raise ValueError("features are unsigned 16-bit integers")
-        result = np.zeros((len(rows), 2))
+        result = np.zeros((len(rows), 3))
         flags = np.zeros(len(rows), np.uint8)
 
         def take(i, answer):
             gaze = wire.parse(Gaze, answer)
-            result[i] = gaze.azimuth_deg, gaze.elevation_deg
+            result[i] = gaze.azimuth_deg, gaze.elevation_deg, gaze.sigma_deg
             flags[i] = gaze.flags
 
         bodies = [wire.body("struct sg_infer", feature=row) for row in rows.tolist()]
         self._exchange.request_many(lib.SG_MSG_INFER, bodies, take)
-        return Inference(result[:, 0], result[:, 1], flags)
+        return Inference(result[:, 0], result[:, 1], flags, result[:, 2])
 
     def model_info(self):
         """ModelInfo of both slots and the RAM trial."""
@@ -245,17 +246,19 @@ class Device:
             return self._exposure(lib.SG_EXPOSURE_AUTO if auto else lib.SG_EXPOSURE_HOLD)
         return self._exposure(lib.SG_EXPOSURE_GET)
 
-    def recentre(self, offset_deg=None, clear=False):
-        """Recentre offset in force.
+    def recentre(self, offset_deg=None, gain=None, clear=False):
+        """Recentre: the correction in force, gaze = g + offset + G g of the model's output g.
 
-        offset_deg   (azimuth, elevation) to add to the model's output from now on;  clear   True: none
+        offset_deg   (azimuth, elevation) from now on, rounded to 1/128 deg
+        gain         G from now on, 2 x 2 degrees per degree, rounded to 1/512; None with an offset: zero
+        clear        True: no correction
+        Raises ValueError when a number does not fit.
         """
         fields = {"op": lib.SG_RECENTRE_CLEAR if clear else lib.SG_RECENTRE_GET}
         if offset_deg is not None:
-            steps = [int(round(128 * value)) for value in offset_deg]
-            if max(map(abs, steps)) > 32767:
-                raise ValueError(f"a recentre offset of {offset_deg} deg is beyond +-255 deg")
-            fields = {"op": lib.SG_RECENTRE_SET, "az_deg_q7": steps[0], "el_deg_q7": steps[1]}
+            fields = {"op": lib.SG_RECENTRE_SET, "affine": wire.affine(offset_deg, gain)._asdict()}
+        elif gain is not None:
+            raise ValueError("a recentre gain goes with an offset")
         return self._exchange.request(lib.SG_MSG_RECENTRE, wire.body("struct sg_recentre", **fields),
                                       Recentre)
 

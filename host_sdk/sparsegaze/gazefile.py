@@ -3,14 +3,16 @@
 
 Columns: t_us (device time, mean sample time), host_time_s (when it arrived), seq, azimuth_deg, elevation_deg
 (exact multiples of 1/128 deg; nan where no gaze came), flags (bits of enum sg_flag), s0..s5 (features),
-recentre_az_deg, recentre_el_deg (offset included in the gaze). `replay` computes the gaze of such a file
-again and compares the bits.
+recentre_az_deg, recentre_el_deg, recentre_az_az, recentre_az_el, recentre_el_az, recentre_el_el (the
+correction included in the gaze: offset, and gains in multiples of 1/512), sigma_deg (standard deviation by
+the model's own account; nan where it gives none). `replay` computes the gaze of such a file again and
+compares the bits.
 """
 
 import os
 
 from .errors import RecordingError
-from .replay import DEG_Q7
+from .replay import AFFINE_COLUMNS, DEG_Q7, GAIN_Q9
 
 COLUMNS = (
     "t_us",
@@ -25,8 +27,9 @@ COLUMNS = (
     "s3",
     "s4",
     "s5",
-    "recentre_az_deg",
-    "recentre_el_deg",
+    *AFFINE_COLUMNS["offset_q7"],
+    *AFFINE_COLUMNS["gain_q9"],
+    "sigma_deg",
 )
 
 
@@ -64,15 +67,16 @@ class GazeCsv:
             else f"nan,nan,{raw.flags}"
         )
         self._lines.append(
-            "%d,%.6f,%d,%s,%s,%.7f,%.7f\n"
+            "%d,%.6f,%d,%s,%s,%.7f,%.7f,%.9f,%.9f,%.9f,%.9f,%s\n"
             % (
                 frame.t_us,
                 frame.host_time,
                 frame.seq,
                 angles,
                 ",".join("%d" % v for v in raw.feature),
-                raw.recentre_az_deg_q7 / DEG_Q7,
-                raw.recentre_el_deg_q7 / DEG_Q7,
+                *(value / DEG_Q7 for value in raw.recentre.offset_deg_q7),
+                *(value / GAIN_Q9 for value in raw.recentre.gain_q9),
+                f"{gaze.sigma_deg:.6g}" if gaze is not None else "nan",
             )
         )
         self.rows += 1

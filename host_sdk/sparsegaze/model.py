@@ -208,11 +208,11 @@ class DeviceModel:
                     ("elevation_deg_q7", "<i2"),
                     ("infer_us", "<u2"),
                     ("flags", "u1"),
-                    ("reserved", "u1"),
+                    ("sigma_log2_q4", "u1"),
                 ]
             ),
         )
-        recentre = ffi.new("int16_t[2]", [int(v) for v in recentre_q7(recentre_deg)])
+        recentre = ffi.new("struct sg_affine *", {"offset_deg_q7": recentre_q7(recentre_deg).tolist()})
         gaze = ffi.cast("struct sg_gaze *", ffi.from_buffer(out, require_writable=True))
         lib.sg_batch_infer(
             self._view[0], ffi.from_buffer("uint16_t[]", features), ffi.NULL, recentre, gaze, len(features)

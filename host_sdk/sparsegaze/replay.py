@@ -7,23 +7,39 @@ sparsegaze._core.
 
 import csv
 import os
+from typing import NamedTuple
 
 import numpy as np
 
 from .errors import ModelError, RecordingError
 
 DEG_Q7 = 128.0
+GAIN_Q9 = 512.0
 CHANNELS = 6
+AFFINE = np.dtype([("offset_q7", "<i2", (2,)), ("gain_q9", "i1", (4,))])  # struct sg_affine
+AFFINE_COLUMNS = {
+    "offset_q7": ("recentre_az_deg", "recentre_el_deg"),
+    "gain_q9": ("recentre_az_az", "recentre_az_el", "recentre_el_az", "recentre_el_el"),
+}
 
 
-def infer(model, features, raw_flags=None, recentre_q7=None):
+class Gazes(NamedTuple):
+    """What the device sends of n frames: q7 int16 [n, 2] azimuth and elevation, 1/128 deg; flags and
+    sigma_log2_q4 uint8 [n] as in struct sg_gaze."""
+
+    q7: np.ndarray
+    flags: np.ndarray
+    sigma_log2_q4: np.ndarray
+
+
+def infer(model, features, raw_flags=None, recentre=None):
     """Gaze of every frame, as the device computes it.
 
     model        DeviceModel, or None for a device without one
     features     uint16 [n, d], d <= 6
     raw_flags    uint8 [n], flags of the raw frames; None: 0
-    recentre_q7  int16 [n, 2] or [2], offset in force, 1/128 deg; None: 0
-    Returns (gaze_q7 int16 [n, 2] azimuth and elevation in 1/128 deg, flags uint8 [n]). Raises ModelError.
+    recentre     AFFINE [n] or one, correction in force; None: none
+    Returns Gazes. Raises ModelError.
     """
     from . import _core
 
@@ -33,8 +49,8 @@ def infer(model, features, raw_flags=None, recentre_q7=None):
     six = np.zeros((n, CHANNELS), np.uint16)
     six[:, : features.shape[1]] = features
     flags = np.zeros(n, np.uint8) if raw_flags is None else np.ascontiguousarray(raw_flags, np.uint8)
-    offsets = np.zeros(2, np.int16) if recentre_q7 is None else np.asarray(recentre_q7, np.int16)
-    offsets = np.ascontiguousarray(np.broadcast_to(offsets, (n, 2)))
+    affine = np.zeros((), AFFINE) if recentre is None else np.asarray(recentre, AFFINE)
+    affine = np.ascontiguousarray(np.broadcast_to(affine, n))
     view = ffi.NULL
     if model is not None:
         image = ffi.from_buffer("uint8_t[]", model.image)
@@ -44,10 +60,8 @@ def infer(model, features, raw_flags=None, recentre_q7=None):
             raise ModelError(f"the core refuses this model (error {status})", "fit the recording again")
     size = ffi.sizeof("struct sg_gaze")
     out = ffi.new("struct sg_gaze[]", max(n, 1))
-    # The core takes one offset per batch: cut where it changes.
-    edges = (
-        np.flatnonzero(np.any(np.diff(offsets.astype(np.int32), axis=0) != 0, axis=1)) + 1 if n > 1 else []
-    )
+    # The core takes one correction per batch: cut where it changes.
+    edges = np.flatnonzero(np.diff(affine.view("<u8"))) + 1
     for begin, end in zip([0, *edges], [*edges, n]):
         if end > begin:
             # A saturated gaze is reported as SG_E_RANGE and holds what the device sends too.
@@ -55,16 +69,22 @@ def infer(model, features, raw_flags=None, recentre_q7=None):
                 view,
                 ffi.from_buffer("uint16_t[]", six[begin:end]),
                 ffi.from_buffer("uint8_t[]", flags[begin:end]),
-                ffi.new("int16_t[2]", [int(v) for v in offsets[begin]]),
+                ffi.cast("struct sg_affine *", ffi.from_buffer(affine[begin:end])),
                 out + int(begin),
                 int(end - begin),
             )
     layout = np.dtype(
-        [("t_us", "<u4"), ("q7", "<i2", (2,)), ("infer_us", "<u2"), ("flags", "u1"), ("reserved", "u1")]
+        [("t_us", "<u4"), ("q7", "<i2", (2,)), ("infer_us", "<u2"), ("flags", "u1"), ("sigma", "u1")]
     )
     assert layout.itemsize == size
     frames = np.frombuffer(ffi.buffer(out, n * size), layout) if n else np.zeros(0, layout)
-    return frames["q7"].copy(), frames["flags"].copy()
+    return Gazes(frames["q7"].copy(), frames["flags"].copy(), frames["sigma"].copy())
+
+
+def sigma_code(sigma_deg):
+    """Degrees as a stream's CSV has them -> sg_gaze.sigma_log2_q4; NaN is 0, unknown."""
+    known = np.isfinite(sigma_deg) & (sigma_deg > 0)
+    return np.where(known, np.round(16.0 * (np.log2(np.where(known, sigma_deg, 1.0)) + 8.0)), 0)
 
 
 class Replay:
@@ -84,8 +104,8 @@ class Replay:
 def run(path, model):
     """Compute every frame of a recording or of a stream's CSV again, and compare with the gaze in it, if any.
 
-    path   CSV with columns t_us and s0..; of a stream's CSV also azimuth_deg, elevation_deg, flags and
-           recentre_*_deg
+    path   CSV with columns t_us and s0..; of a stream's CSV also azimuth_deg, elevation_deg, flags,
+           recentre_* and sigma_deg (a file of an earlier version has no gains and no sigma)
     model  DeviceModel
     Returns Replay. Raises RecordingError (naming line and column), ModelError.
     """
@@ -105,11 +125,12 @@ def run(path, model):
     carried = 0xFF & ~(lib.SG_FLAG_VALID | lib.SG_FLAG_NO_MODEL | lib.SG_FLAG_OUT_OF_RANGE)
     device = all(name in columns for name in ("azimuth_deg", "elevation_deg", "flags"))
     flags = integers(path, columns, lines, "flags", 0, 255) if device else np.zeros(n, np.int64)
-    recentre = np.zeros((n, 2), np.int16)
-    for axis, name in enumerate(("recentre_az_deg", "recentre_el_deg")):
-        if name in columns:
-            recentre[:, axis] = np.round(numbers(path, columns, lines, name) * DEG_Q7)
-    gaze_q7, out = infer(model, features, flags & carried, recentre)
+    recentre = np.zeros(n, AFFINE)
+    for field, unit in (("offset_q7", DEG_Q7), ("gain_q9", GAIN_Q9)):
+        for k, name in enumerate(AFFINE_COLUMNS[field]):
+            if name in columns:
+                recentre[field][:, k] = np.round(numbers(path, columns, lines, name) * unit)
+    gaze_q7, out, sigma = infer(model, features, flags & carried, recentre)
     compared = differing = 0
     if device:
         said = np.column_stack(
@@ -117,6 +138,8 @@ def run(path, model):
         )
         have = np.isfinite(said).all(axis=1)
         same = (np.round(np.where(have[:, None], said, 0.0) * DEG_Q7) == gaze_q7).all(axis=1) & (flags == out)
+        if "sigma_deg" in columns:
+            same &= sigma_code(numbers(path, columns, lines, "sigma_deg")) == sigma
         compared, differing = int(have.sum()), int(np.sum(have & ~same))
     return Replay(t_us, gaze_q7, out, lib.SG_FLAG_VALID, compared, differing)
 

@@ -12,7 +12,7 @@ from typing import Optional
 import numpy as np
 
 from .errors import CalibrationError
-from .replay import DEG_Q7
+from .replay import AFFINE, DEG_Q7
 
 LEAD_S = 0.3  # between the decision to start and the first target
 CALM_S = 0.5  # this long without a change of exposure counts as settled
@@ -44,13 +44,19 @@ class FrameLog:
                 *raw.feature,
                 raw.flags,
                 raw.model_crc,
-                raw.recentre_az_deg_q7,
-                raw.recentre_el_deg_q7,
+                *raw.recentre.offset_deg_q7,
+                *raw.recentre.gain_q9,
                 gaze is not None,
                 *(
-                    (gaze.azimuth_deg_q7, gaze.elevation_deg_q7, gaze.flags, gaze.infer_us)
+                    (
+                        gaze.azimuth_deg_q7,
+                        gaze.elevation_deg_q7,
+                        gaze.flags,
+                        gaze.sigma_log2_q4,
+                        gaze.infer_us,
+                    )
                     if gaze is not None
-                    else (0, 0, 0, 0)
+                    else (0, 0, 0, 0, 0)
                 ),
             )
         )
@@ -68,10 +74,14 @@ FRAME_FLAT = np.dtype(
         ("model_crc", "u4"),
         ("recentre_az_q7", "i2"),
         ("recentre_el_q7", "i2"),
+    ]
+    + [(f"recentre_gain{i}", "i1") for i in range(4)]
+    + [
         ("has_gaze", "?"),
         ("azimuth_q7", "i2"),
         ("elevation_q7", "i2"),
         ("gaze_flags", "u1"),
+        ("gaze_sigma", "u1"),
         ("infer_us", "u2"),
     ]
 )
@@ -84,10 +94,11 @@ FRAME = np.dtype(
         ("features", "u2", (6,)),
         ("raw_flags", "u1"),
         ("model_crc", "u4"),
-        ("recentre_q7", "i2", (2,)),
+        ("recentre", AFFINE),
         ("has_gaze", "?"),
         ("gaze_q7", "i2", (2,)),
         ("gaze_flags", "u1"),
+        ("gaze_sigma", "u1"),
         ("infer_us", "u2"),
     ]
 )
@@ -98,8 +109,8 @@ assert FRAME.itemsize == FRAME_FLAT.itemsize
 class Run:
     """A finished (or cut) run.
 
-    frames          record array [n] of FRAME: seq, t_us, host_s, features, raw_flags, model_crc, recentre_q7,
-                    has_gaze, gaze_q7 (azimuth, elevation in 1/128 deg), gaze_flags, infer_us
+    frames          record array [n] of FRAME: seq, t_us, host_s, features, raw_flags, model_crc, recentre,
+                    has_gaze, gaze_q7 (azimuth, elevation in 1/128 deg), gaze_flags, gaze_sigma, infer_us
     onset_us        int64 [k], device time at which each target really appeared; k < n_targets when cut
     target_index    int64 [n], which target was up; -1 outside the plan
     lost, torn, bad frames missing by sequence number; with a part missing; with a bad CRC

@@ -201,9 +201,10 @@ def evaluate(done, model, true_deg=None):
     error = np.full(len(frames), np.nan)
     gaze, target = done.gaze_deg[counted], done.target_deg[counted]
     error[counted] = metrics.frame_errors_deg(gaze[:, 0], gaze[:, 1], target[:, 0], target[:, 1])
-    host_q7, host_flags = replay.infer(model, frames["features"], frames["raw_flags"], frames["recentre_q7"])
+    host = replay.infer(model, frames["features"], frames["raw_flags"], frames["recentre"])
     have = frames["has_gaze"]
-    same = (host_q7 == frames["gaze_q7"]).all(axis=1) & (host_flags == frames["gaze_flags"])
+    same = (host.q7 == frames["gaze_q7"]).all(axis=1) & (host.flags == frames["gaze_flags"])
+    same &= host.sigma_log2_q4 == frames["gaze_sigma"]
     if model is not None:
         same &= frames["model_crc"] == model.crc
     changes = int(np.sum((frames["raw_flags"] & lib.SG_FLAG_EXPOSURE) != 0))

@@ -7,6 +7,8 @@ No layout is written down here: every record below takes its fields from the str
 from collections import namedtuple
 from typing import NamedTuple
 
+import numpy as np
+
 from .errors import ProtocolError, SparsegazeError
 
 try:
@@ -28,6 +30,9 @@ ERROR_TEXT = {
 }
 
 
+GAIN_STEPS_MAX = 127  # of 1/512; -128 is legal on the wire, and left out for symmetry
+
+
 def record(struct, name):
     """A named tuple with the fields of a C struct; arrays become tuples."""
     return namedtuple(name, [field for field, _ in ffi.typeof(struct).fields])
@@ -44,8 +49,8 @@ class Hello(record("struct sg_hello", "Hello")):
 
     @property
     def board_text(self):
-        return {lib.SG_BOARD_TEMPLATE: "template", lib.SG_BOARD_NANO328P: "Arduino Nano (ATmega328P)"}.get(
-            self.board, f"board {self.board}")
+        return {lib.SG_BOARD_TEMPLATE: "template", lib.SG_BOARD_NANO328P: "Arduino Nano (ATmega328P)",
+                lib.SG_BOARD_MPS2AN386: "MPS2 AN386 (Cortex-M4, QEMU)"}.get(self.board, f"board {self.board}")
 
 
 class Status(record("struct sg_status", "Status")):
@@ -81,6 +86,11 @@ class Gaze(record("struct sg_gaze", "Gaze")):
     def valid(self):
         return bool(self.flags & lib.SG_FLAG_VALID)
 
+    @property
+    def sigma_deg(self):
+        """Standard deviation that the model gives its own output, degrees; NaN where it gives none."""
+        return float(sigma_deg(self.sigma_log2_q4))
+
 
 class Exposure(record("struct sg_exposure", "Exposure")):
     """Exposures in force; struct sg_exposure."""
@@ -96,18 +106,35 @@ class Exposure(record("struct sg_exposure", "Exposure")):
         return self.op == lib.SG_EXPOSURE_AUTO
 
 
+class Affine(record("struct sg_affine", "Affine")):
+    """Correction of a model's output, gaze = g + offset + G g; struct sg_affine."""
+
+    __slots__ = ()
+
+    @property
+    def offset_deg(self):
+        """(azimuth, elevation) at g = 0, degrees."""
+        return tuple(value / 128 for value in self.offset_deg_q7)
+
+    @property
+    def gain(self):
+        """G by rows: ((az from az, az from el), (el from az, el from el)), degrees per degree."""
+        steps = [value / 512 for value in self.gain_q9]
+        return (steps[0], steps[1]), (steps[2], steps[3])
+
+
 class Recentre(record("struct sg_recentre", "Recentre")):
-    """Offset in force; struct sg_recentre."""
+    """Correction in force; struct sg_recentre."""
 
     __slots__ = ()
 
     @property
     def azimuth_deg(self):
-        return self.az_deg_q7 / 128
+        return self.affine.offset_deg[0]
 
     @property
     def elevation_deg(self):
-        return self.el_deg_q7 / 128
+        return self.affine.offset_deg[1]
 
 
 Pong = record("struct sg_pong", "Pong")
@@ -230,5 +257,29 @@ class Decoder:
         self._rx = ffi.new("struct sg_link_rx *")
 
 
+def affine(offset_deg, gain=None):
+    """Affine of an offset (azimuth, elevation; degrees) and a gain (2 x 2, or None: zero), rounded.
+
+    Raises ValueError when one is not finite or beyond the range of the device's numbers.
+    """
+    offset = np.floor(np.asarray(offset_deg, float) * 128 + 0.5)
+    steps = np.floor((np.zeros((2, 2)) if gain is None else np.asarray(gain, float)) * 512 + 0.5)
+    if offset.shape != (2,) or not np.all(np.abs(offset) <= 32767):
+        raise ValueError(f"a recentre offset of {offset_deg} deg is not inside +-255 deg")
+    if steps.shape != (2, 2) or not np.all(np.abs(steps) <= GAIN_STEPS_MAX):
+        raise ValueError(f"a recentre gain of {gain} is not inside +-{GAIN_STEPS_MAX / 512:.3f}")
+    return Affine(tuple(int(v) for v in offset), tuple(int(v) for v in steps.ravel()))
+
+
+def sigma_deg(code):
+    """sg_gaze.sigma_log2_q4 (a number or an array) -> degrees, float64; NaN for 0, which means unknown."""
+    code = np.asarray(code, float)
+    return np.where(code > 0, 2.0 ** (code / 16.0 - 8.0), np.nan)
+
+
 def _plain(value):
-    return value if isinstance(value, int) else tuple(value)
+    if isinstance(value, int):
+        return value
+    if ffi.typeof(value) is ffi.typeof("struct sg_affine"):
+        return Affine(tuple(value.offset_deg_q7), tuple(value.gain_q9))
+    return tuple(value)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from sparsegaze import replay
+from sparsegaze import replay, wire
 from sparsegaze.device import Frame
 from sparsegaze.errors import DisconnectedError
 from sparsegaze.model import DeviceModel
@@ -123,7 +123,7 @@ class FakeDevice:
         self.stored_us = None
         self.hello = SimpleNamespace(board_text="fake board", firmware_text="0.0.0")
         self.clock = SimpleNamespace(drift=0.0)
-        self.offset_q7 = [0, 0]
+        self.affine = wire.affine((0, 0))
         self.stream, self.lost, self.bad, self.incomplete = [], 0, 0, 0
         self.screen = FakeScreen(self)
 
@@ -153,14 +153,14 @@ class FakeDevice:
     def read_model(self, slot=None):
         return self.model.image
 
-    def recentre(self, offset_deg=None, clear=False):
+    def recentre(self, offset_deg=None, gain=None, clear=False):
         if clear or offset_deg is not None:
             self.stored_us = self.t_us + 200_000
         if clear:
-            self.offset_q7 = [0, 0]
+            self.affine = wire.affine((0, 0))
         elif offset_deg is not None:
-            self.offset_q7 = [int(round(128 * v)) for v in offset_deg]
-        return Recentre(*self.offset_q7, lib.SG_RECENTRE_GET, 0)
+            self.affine = wire.affine(offset_deg, gain)
+        return Recentre(self.affine, lib.SG_RECENTRE_GET, 0)
 
     def eye_deg(self, t_us):
         now = (0.0, 0.0)
@@ -186,14 +186,17 @@ class FakeDevice:
                 signal += 1500
             feature = np.clip(np.round(signal), 0, 65535).astype(np.uint16)
             flags = self.raw_flags(self.t_us)
-            q7, gaze_flags = replay.infer(
-                self.model, feature[None], np.array([flags], np.uint8), self.offset_q7
+            q7, gaze_flags, sigma = replay.infer(
+                self.model,
+                feature[None],
+                np.array([flags], np.uint8),
+                np.array(tuple(self.affine), replay.AFFINE),
             )
-            gaze = Gaze(self.t_us, int(q7[0, 0]), int(q7[0, 1]), 700, int(gaze_flags[0]), 0)
+            gaze = Gaze(self.t_us, *map(int, (*q7[0], 700, gaze_flags[0], sigma[0])))
             if self.spoil:
                 gaze = self.spoil(self.seq, gaze)
             crc = self.model.crc if self.model else 0
-            raw = Raw(self.t_us, crc, *self.offset_q7, tuple(int(v) for v in feature), 1500, flags, 0)
+            raw = Raw(self.t_us, crc, self.affine, tuple(int(v) for v in feature), 1500, flags, 0)
             yield Frame(
                 self.seq,
                 self.t_us,

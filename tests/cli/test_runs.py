@@ -183,7 +183,7 @@ def test_a_recentre_during_the_stream_stays_bit_identical(held_out):
         gaze=True,
         on_frame=lambda frame: device.recentre((1.5, -2.0)) if frame.seq == 1500 else None,
     )
-    assert len(np.unique(run.frames["recentre_q7"], axis=0)) == 2
+    assert len(np.unique(run.frames["recentre"]["offset_q7"], axis=0)) == 2
     assert validate.evaluate(run, device.model).bit_identical
 
 
@@ -265,7 +265,7 @@ def test_recentre_without_a_steady_gaze_leaves_the_offset_alone(options, word):
     device.recentre((1.0, 0.0))
     with pytest.raises(CalibrationError, match=word):
         recentre.run(device, device.screen)
-    assert device.offset_q7 == [128, 0]
+    assert device.affine.offset_deg == (1.0, 0.0)
 
 
 def test_recentre_without_a_model_says_so():

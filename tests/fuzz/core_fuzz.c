@@ -195,9 +195,13 @@ static void fuzz_model(void)
             uint16_t feature[6];
             for (int j = 0; j < 6; j++)
                 feature[j] = (uint16_t)(draw(3) ? draw(65536) : (draw(2) ? 65535 : 0));
-            const int16_t recentre[2] = { (int16_t)(draw(65536) - 32768), (int16_t)(draw(65536) - 32768) };
+            struct sg_affine recentre;
+            for (int j = 0; j < 2; j++)
+                recentre.offset_deg_q7[j] = (int16_t)(draw(65536) - 32768);
+            for (int j = 0; j < 4; j++)
+                recentre.gain_q9[j] = (int8_t)(draw(256) - 128);
             struct sg_gaze gaze;
-            const int result = sg_track_infer(&view, feature, (uint8_t)draw(256), recentre, &gaze);
+            const int result = sg_track_infer(&view, feature, (uint8_t)draw(256), &recentre, &gaze);
             HOLDS(result == SG_OK || result == SG_E_RANGE, "result of inference");
             HOLDS(result == SG_OK || !(gaze.flags & SG_FLAG_VALID), "a saturated gaze is not valid");
         }

@@ -58,7 +58,7 @@ def test_a_budget_fails_both_ways():
 
 @pytest.fixture
 def costly(board, tmp_path):
-    """A streaming board whose every frame evaluates 64 kernels and 6 guards: (VirtualNano, Device, model)."""
+    """A streaming board whose every frame evaluates 64 kernels, 6 guards and a correction: (VirtualNano, Device, model)."""
     nano, device = board(models={}, state_dir=tmp_path / "looking")
     device.set_stream(raw=True)
     # Frames without blinks: the median over some seconds of a person who looks straight ahead.
@@ -67,6 +67,7 @@ def costly(board, tmp_path):
     nano.stop()
     model = costly_model(middle)
     nano, device = board(models={0: model.image})
+    device.recentre((0.5, -0.5), [[0.05, -0.02], [0.01, 0.03]])
     device.set_stream(raw=True, gaze=True)
     collect(device, 20)
     nano.control.markers_clear()

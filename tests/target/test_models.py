@@ -63,7 +63,7 @@ def test_streamed_gaze_is_what_the_host_computes_from_the_raw_frame(board):
     assert {frame.raw.model_crc for frame in frames} == {model.crc}
     for frame in frames:
         raw, gaze = frame.raw, frame.gaze
-        recentre_deg = raw.recentre_az_deg_q7 / 128, raw.recentre_el_deg_q7 / 128
+        recentre_deg = raw.recentre.offset_deg
         (az, el, flags), = host_gaze(model, np.array([raw.feature]), recentre_deg)
         flags |= raw.flags
         if raw.flags & (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_RECOVERING):

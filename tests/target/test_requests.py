@@ -14,12 +14,12 @@ SHORTEST = {                        # request: bytes of its struct
     lib.SG_MSG_HELLO: 0, lib.SG_MSG_STATUS: 0, lib.SG_MSG_MODEL_INFO: 0,
     lib.SG_MSG_PING: 4, lib.SG_MSG_MODE: 1, lib.SG_MSG_TRIAL_USE: 1, lib.SG_MSG_REBOOT: 1, lib.SG_MSG_BAUD: 1,
     lib.SG_MSG_INFER: 12, lib.SG_MSG_MODEL_READ: 4, lib.SG_MSG_MODEL_VERIFY: 4, lib.SG_MSG_TRIAL_WRITE: 4,
-    lib.SG_MSG_EXPOSURE: 14, lib.SG_MSG_RECENTRE: 6,
+    lib.SG_MSG_EXPOSURE: 14, lib.SG_MSG_RECENTRE: 10,
 }
 HARMLESS = {                        # bodies that change nothing but are legal
     lib.SG_MSG_PING: b"abcd", lib.SG_MSG_MODE: b"\0", lib.SG_MSG_TRIAL_USE: b"\0", lib.SG_MSG_BAUD: b"\0",
     lib.SG_MSG_INFER: bytes(12), lib.SG_MSG_MODEL_READ: b"\0\0\0\1", lib.SG_MSG_MODEL_VERIFY: bytes(4),
-    lib.SG_MSG_TRIAL_WRITE: b"\0\0\2\1x", lib.SG_MSG_EXPOSURE: bytes(14), lib.SG_MSG_RECENTRE: bytes(6),
+    lib.SG_MSG_TRIAL_WRITE: b"\0\0\2\1x", lib.SG_MSG_EXPOSURE: bytes(14), lib.SG_MSG_RECENTRE: bytes(10),
 }
 
 
@@ -85,8 +85,8 @@ def test_longer_body_is_accepted_and_its_excess_ignored(board, kind):
     (lib.SG_MSG_BAUD, b"\x02", lib.SG_E_ARG),
     (lib.SG_MSG_TRIAL_USE, b"\x02", lib.SG_E_ARG),
     (lib.SG_MSG_EXPOSURE, bytes(12) + b"\x04\0", lib.SG_E_ARG),
-    (lib.SG_MSG_RECENTRE, bytes(4) + b"\x03\0", lib.SG_E_ARG),
-    (lib.SG_MSG_RECENTRE, bytes(4) + b"\x01\0", lib.SG_E_STATE),
+    (lib.SG_MSG_RECENTRE, bytes(8) + b"\x03\0", lib.SG_E_ARG),
+    (lib.SG_MSG_RECENTRE, bytes(8) + b"\x01\0", lib.SG_E_STATE),
     (lib.SG_MSG_MODEL_VERIFY, b"\0\0\x03\0", lib.SG_E_ARG),
     (lib.SG_MSG_MODEL_READ, b"\0\0\x03\1", lib.SG_E_ARG),
     (lib.SG_MSG_MODEL_READ, b"\0\0\x00\0", lib.SG_E_ARG),

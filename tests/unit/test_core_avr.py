@@ -36,7 +36,7 @@ def gaze_bytes(parts, feature):
     view, out = View(parts.image()), ffi.new("struct sg_gaze[]", len(feature))
     assert view.verdict == lib.SG_OK
     lib.sg_batch_infer(view.view, ffi.from_buffer("uint16_t[]", np.ascontiguousarray(feature)), ffi.NULL,
-                       ffi.new("int16_t[2]"), out, len(feature))
+                       ffi.new("struct sg_affine *"), out, len(feature))
     return bytes(ffi.buffer(out))
 
 

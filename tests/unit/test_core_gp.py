@@ -199,7 +199,7 @@ def golden_crc(core_ffi=ffi, core_lib=lib):
     assert core_lib.sg_model_open(view, image, len(image), 0) == 0
     core_lib.sg_batch_infer(view, core_ffi.from_buffer("uint16_t[]", np.ascontiguousarray(feature)),
                             core_ffi.NULL,
-                            core_ffi.new("int16_t[2]"), out, 64)
+                            core_ffi.new("struct sg_affine *"), out, 64)
     return zlib.crc32(bytes(core_ffi.buffer(out)))
 
 

@@ -13,10 +13,10 @@ from sparsegaze._core import ffi, lib
 
 # A changed hash under an old version number means that two programs of the same version would not understand
 # each other: raise SG_WIRE_VERSION or SG_MODEL_VERSION in the header and add the line.
-WIRE_LAYOUT = {1: "55aa88f91cd2ff83"}
+WIRE_LAYOUT = {1: "55aa88f91cd2ff83", 2: "0b880ed727b526c8"}
 MODEL_LAYOUT = {1: "8170e606b7f66b46"}
 
-STRUCTS = ("sg_head", "sg_hello", "sg_status", "sg_ping", "sg_pong", "sg_mode", "sg_infer", "sg_gaze",
+STRUCTS = ("sg_head", "sg_hello", "sg_status", "sg_ping", "sg_pong", "sg_mode", "sg_infer", "sg_affine", "sg_gaze",
            "sg_raw", "sg_counts", "sg_model_info", "sg_model_at", "sg_model_data", "sg_model_verdict",
            "sg_exposure",
            "sg_recentre", "sg_error", "sg_model_head", "sg_model_guard", "sg_link_rx", "sg_expose_led")
@@ -44,11 +44,11 @@ def test_layout_hash_sees_a_moved_field_but_not_a_comment(tmp_path, monkeypatch)
     text = (avr.CORE / "sg_wire.h").read_text(encoding="utf-8")
     monkeypatch.setattr(avr, "CORE", tmp_path)
     (tmp_path / "sg_wire.h").write_text(text.replace("// device time now", "// now"), encoding="utf-8")
-    assert layout_hash("sg_wire.h") == WIRE_LAYOUT[1]
+    assert layout_hash("sg_wire.h") == WIRE_LAYOUT[lib.SG_WIRE_VERSION]
     swapped = text.replace("    uint8_t board;", "    uint8_t bord;")
     assert swapped != text
     (tmp_path / "sg_wire.h").write_text(swapped, encoding="utf-8")
-    assert layout_hash("sg_wire.h") != WIRE_LAYOUT[1]
+    assert layout_hash("sg_wire.h") != WIRE_LAYOUT[lib.SG_WIRE_VERSION]
 
 
 def test_no_struct_of_the_wire_has_padding():

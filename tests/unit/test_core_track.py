@@ -20,11 +20,11 @@ def plain(bias_deg_q7=(0, 0)):
                  weight_frac_bits=6)
 
 
-def infer(view, feature, raw_flags=0, recentre=(0, 0)):
-    out = ffi.new("struct sg_gaze *")
+def infer(view, feature, raw_flags=0, recentre=(0, 0), gain=(0, 0, 0, 0)):
+    out, affine = ffi.new("struct sg_gaze *"), ffi.new("struct sg_affine *", (list(recentre), list(gain)))
     ffi.memmove(out, b"\xAA" * 12, 12)
-    result = lib.sg_track_infer(view, [int(x) for x in feature], raw_flags, list(recentre), out)
-    assert out.t_us == out.infer_us == out.reserved == 0        # nothing of the old frame is left
+    result = lib.sg_track_infer(view, [int(x) for x in feature], raw_flags, affine, out)
+    assert out.t_us == out.infer_us == out.sigma_log2_q4 == 0   # nothing of the old frame is left
     return result, (out.azimuth_deg_q7, out.elevation_deg_q7), out.flags
 
 
@@ -57,13 +57,28 @@ def test_recentre_adds_and_saturates_without_wrapping(bias, recentre, sums, satu
     assert flags == (lib.SG_FLAG_OUT_OF_RANGE if saturates else lib.SG_FLAG_VALID)
 
 
+@pytest.mark.parametrize("gaze", [(0, 0), (1, -1), (2560, -2560), (32767, -32768), (-32768, -32768), (-3, 255)])
+def test_gain_is_rounded_half_up_from_exact_integers_and_saturates(gaze):
+    rng = np.random.default_rng(8)
+    view = View(plain(gaze).image()).view
+    corners = list(itertools.product((-128, 127), repeat=4))
+    for gain in [(0, 0, 0, 0), (1, 0, 0, -1), (0, 1, 1, 0), *corners, *rng.integers(-128, 128, (200, 4)).tolist()]:
+        offset = rng.integers(-32768, 32768, 2).tolist() if gain[0] % 3 == 0 else [0, 0]
+        exact = [gaze[i] + offset[i] + (gain[2 * i] * gaze[0] + gain[2 * i + 1] * gaze[1] + 256) // 512
+                 for i in range(2)]
+        expected = tuple(min(max(value, -32768), 32767) for value in exact)
+        result, found, flags = infer(view, [200] * 6, 0, offset, gain)
+        assert found == expected, (gain, offset)
+        assert (result == lib.SG_E_RANGE) == (list(expected) != exact) == (flags == lib.SG_FLAG_OUT_OF_RANGE)
+
+
 def test_batch_equals_single_frames_and_the_twin():
     rng = np.random.default_rng(5)
     parts = random_parts(rng, 40, guards=1)
     feature = features_near(rng, parts, 200)
     raw = rng.choice([0, 8, 16, 32, 64, 128], 200).astype(np.uint8)
     view, out = View(parts.image()), ffi.new("struct sg_gaze[200]")
-    recentre = ffi.new("int16_t[2]", [100, -50])
+    recentre = ffi.new("struct sg_affine *", ([100, -50], [0] * 4))
     lib.sg_batch_infer(view.view, ffi.from_buffer("uint16_t[]", feature), ffi.from_buffer("uint8_t[]", raw),
                        recentre, out, 200)
     deg, outside = twin(parts, feature)

@@ -1,64 +1,72 @@
 // SPDX-License-Identifier: Apache-2.0
 // Live state in EEPROM: two copies, each  payload | sequence | CRC-16. A write goes to the older copy, one
 // byte per 3.4 ms, started and left; if power fails in the middle its CRC does not fit and the other copy is
-// still whole.
+// still whole. Records of another size lie elsewhere, so that those of an older firmware outlive the first
+// write of a newer one.
 #include "port.h"
 
 #include <avr/eeprom.h>
-#include <string.h>
 
-enum { COPY_BYTES = HAL_RECORD_MAX + 4 };
+enum { TAIL_BYTES = 4, SIZE_V1 = 24, PLACE_V2 = 2 * (SIZE_V1 + TAIL_BYTES) };
 
-static uint8_t image[COPY_BYTES];       // being written; payload_bytes of payload, sequence, CRC
-static uint8_t image_bytes;             // 0: nothing under way
+// Being written: the record where it lies, and its tail.
+static const uint8_t *payload;
+static struct { uint16_t sequence, crc; } tail;
+_Static_assert(sizeof tail == TAIL_BYTES, "layout in EEPROM");
+static uint8_t payload_bytes;           // 0: nothing under way
 static uint8_t position;
 static uint8_t copy;                    // where the next write goes
 static uint16_t sequence;               // of the newest whole copy
 static uint16_t writes;
 
-static uint8_t read_copy(uint8_t which, uint8_t payload_bytes, uint16_t *found)
+static uint16_t place(uint8_t which, uint8_t n)
 {
-    const uint8_t n = payload_bytes + 4;
-    uint16_t crc;
-    eeprom_read_block(image, (const uint8_t *)(uint16_t)(which * COPY_BYTES), n);
-    memcpy(found, image + payload_bytes, sizeof *found);
-    memcpy(&crc, image + payload_bytes + 2, sizeof crc);
-    return sg_wire_crc16(0xFFFF, image, n - 2U) == crc;
+    const uint8_t copy_bytes = n + TAIL_BYTES;
+    return (n == SIZE_V1 ? 0 : PLACE_V2) + (which ? copy_bytes : 0);
+}
+
+// 1 if the copy is whole; *found is then its sequence number.
+static uint8_t check_copy(uint16_t at, uint8_t n, uint16_t *found)
+{
+    uint16_t crc = 0xFFFF;
+    for (uint8_t i = 0; i < n + 2; i++) {
+        const uint8_t byte = eeprom_read_byte((const uint8_t *)(at + i));
+        crc = sg_wire_crc16(crc, &byte, 1);
+    }
+    *found = eeprom_read_word((const uint16_t *)(at + n));
+    return eeprom_read_word((const uint16_t *)(at + n + 2)) == crc;
 }
 
 uint8_t hal_load(void *record, uint8_t n)
 {
     uint16_t found[2];
-    const uint8_t whole_a = read_copy(0, n, &found[0]);
-    const uint8_t whole_b = read_copy(1, n, &found[1]);
+    const uint8_t whole_a = check_copy(place(0, n), n, &found[0]);
+    const uint8_t whole_b = check_copy(place(1, n), n, &found[1]);
     uint8_t newest = 0;
     if (!whole_a && !whole_b)
         return 0;
     if (whole_b && (!whole_a || (int16_t)(found[1] - found[0]) > 0))
         newest = 1;
-    read_copy(newest, n, &sequence);
-    memcpy(record, image, n);
+    sequence = found[newest];
+    eeprom_read_block(record, (const uint8_t *)place(newest, n), n);
     copy = !newest;
     return 1;
 }
 
 uint8_t hal_save(const void *record, uint8_t n)
 {
-    if (image_bytes)
-        return 0;
-    const uint16_t next = sequence + 1;
-    memcpy(image, record, n);
-    memcpy(image + n, &next, sizeof next);
-    const uint16_t crc = sg_wire_crc16(0xFFFF, image, n + 2U);
-    memcpy(image + n + 2, &crc, sizeof crc);
-    image_bytes = n + 4;
+    tail.sequence = sequence + 1;
+    tail.crc = sg_wire_crc16(sg_wire_crc16(0xFFFF, record, n), (const uint8_t *)&tail.sequence,
+                             sizeof tail.sequence);
+    payload = record;
+    payload_bytes = n;
     position = 0;
     return 1;
 }
 
 uint8_t store_busy(void)
 {
-    return image_bytes;
+    return payload_bytes;
 }
 
 uint16_t store_writes(void)
@@ -68,18 +76,20 @@ uint16_t store_writes(void)
 
 void store_poll(void)
 {
-    if (!image_bytes || (EECR & (1 << EEPE)))
+    if (!payload_bytes || (EECR & (1 << EEPE)))
         return;
-    if (position == image_bytes) {
-        image_bytes = 0;
+    if (position == payload_bytes + TAIL_BYTES) {
+        payload_bytes = 0;
         copy = !copy;
         sequence++;
         writes++;
         return;
     }
-    EEAR = (uint16_t)(copy * COPY_BYTES + position);
+    EEAR = place(copy, payload_bytes) + position;
     EECR = 1 << EERE;
-    const uint8_t wanted = image[position++];
+    const uint8_t wanted = position < payload_bytes ? payload[position]
+                                                    : ((const uint8_t *)&tail)[position - payload_bytes];
+    position++;
     if (EEDR == wanted)         // spare the cell, and 3.4 ms
         return;
     EEDR = wanted;

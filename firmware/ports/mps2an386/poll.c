@@ -24,7 +24,7 @@ void hal_describe(struct sg_hello *hello)
     hello->exposure_min_us = 16;
     hello->exposure_max_us = 304;
     hello->page_bytes = 0;
-    hello->board = SG_BOARD_TEMPLATE;
+    hello->board = SG_BOARD_MPS2AN386;
 }
 
 const uint8_t *hal_slot(uint8_t slot)

@@ -29,15 +29,15 @@ static void put(const void *data, uint8_t n)
 static void infer(const struct sg_model_view *view, uint16_t i, uint8_t section, struct sg_gaze *gaze)
 {
     uint16_t feature[6];
-    const int16_t recentre_deg_q7[2] = { 0, 0 };
+    const struct sg_affine recentre = { { 0, 0 }, { 0, 0, 0, 0 } };
     memcpy_P(feature, case_feature[i], sizeof feature);
     if (section == INFER_FLASH) {
         BEGIN(INFER_FLASH);
-        sg_track_infer(view, feature, 0, recentre_deg_q7, gaze);
+        sg_track_infer(view, feature, 0, &recentre, gaze);
         END(INFER_FLASH);
     } else {
         BEGIN(INFER_MEMORY);
-        sg_track_infer(view, feature, 0, recentre_deg_q7, gaze);
+        sg_track_infer(view, feature, 0, &recentre, gaze);
         END(INFER_MEMORY);
     }
     put(gaze, sizeof *gaze);
