@@ -1,35 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussian-process regression in float64: features -> gaze, two outputs sharing one ARD-RBF kernel.
+"""Gaussian-process regression in float64: features -> gaze, two outputs sharing one covariance function.
 
-    y_o(x) = b_o . h(x) + f_o(x) + noise        f_o ~ GP(0, s^2 exp(-1/2 sum_j ((x_j - x'_j) / l_j)^2))
+    y_o(x) = b_o . h(x) + f_o(x) + noise        f_o ~ GP(0, s^2 k(x, x'))
 
-with h(x) = (1, x) or (1) or nothing (least squares on top of the process, Rasmussen & Williams section 2.7),
-and noise covariance  s_n^2 diag(noise_scale) + s_g^2 [same group]:  samples of one fixation share the error
-of where the eye really rested. LED2Gaze section 5.2 is this mean without the noise term. Hyper-parameters by
-marginal likelihood with analytic gradients; every solve goes through one Cholesky factor.
+with k one of kernels.py, h(x) = (1, x) or (1) or nothing (least squares on top of the process, Rasmussen &
+Williams section 2.7), and noise covariance  s_n^2 diag(noise_scale) + s_g^2 [same group]:  samples of one
+fixation share the error of where the eye really rested. LED2Gaze section 5.2 is this mean without the noise
+term (`noise_free`). Hyper-parameters by marginal likelihood with analytic gradients (likelihood.py); every
+solve goes through one Cholesky factor (factor.py). Nothing depends on the order of the samples or on the
+number of threads: samples are put in a canonical order, and BLAS runs on one thread.
 """
 
 import warnings
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, lapack, solve_triangular
-from scipy.optimize import minimize
+from scipy.linalg import solve_triangular
+from threadpoolctl import ThreadpoolController
 
 from .errors import CalibrationError
+from .factor import CONDITION_MOST, EPS, JITTERS, RANK_TOLERANCE, cholesky, extremes, inverse, repaired, residual
+from .kernels import Kernel
+from .kernels import kernel as make_kernel
+from .likelihood import LENGTH_RANGE, Likelihood, learn, thorough
+from .samples import Samples, spread
 
-JITTERS = (0.0, 1e-12, 1e-10, 1e-8, 1e-6)  # relative to the mean diagonal, tried in turn
-LENGTH_RANGE = (0.05, 100.0)  # in standard deviations of the channel
-SIGNAL_RANGE = (1e-2, 1e3)  # in rms gaze
-NOISE_RANGE = (1e-4, 1.0)
-START_SPREAD = 0.7  # natural log, of the random restarts
+LEARN_ROWS = 600  # rows of the likelihood that is searched from several starts
+ROWS_MAX = 3000  # of the process: 9e6 entries, 72 MB a matrix
+ROUNDING_MOST_DEG = 0.01  # proven error of a prediction by rounding; more jitter is added until it is below
+PROBES = 200  # of the rows, and as many places between them, where the error by rounding is bounded
+_blas = ThreadpoolController()
 
 
 @dataclass(frozen=True)
 class Hyper:
     """Kernel parameters in the units of the data.
 
-    length [d] in feature units (inf drops a channel); signal_deg, noise_deg, group_deg standard deviations
+    length [d] in the kernel's length unit: feature units, but for canberra (a pure number) and cosine (rad, the
+    same in all channels); inf drops a channel. signal_deg, noise_deg, group_deg standard deviations
     """
 
     length: np.ndarray
@@ -43,7 +51,13 @@ class GaussianProcess:
     """A fitted process. Make one with `fit`.
 
     x [n, d], y [n, 2] the training data; hyper; mean "zero" | "constant" | "linear"; lml of both outputs
-    condition of the covariance matrix (2-norm); jitter relative to its mean diagonal; dropped channels
+    kernel     kernels.Kernel;  alpha [n, 2] weights of s^2 k(., x_i);  beta [columns, 2] of the mean
+    condition  of the matrix that is solved (2-norm), jitter included; condition_raw without it, inf where it has no
+               Cholesky factor; above 4.5e14 float64 cannot tell it from any larger number (`describe`)
+    jitter     relative to its mean diagonal;  dropped channels;  rows_given to fit (n of them kept)
+    rounding_deg  bound of a prediction's error by float64, inside the data, to first order in 2^-52
+    repair     None, or what was done to a matrix that is no covariance: words, smallest_eigenvalue and
+               removed_share (of the sum of |eigenvalues|)
     """
 
     x: np.ndarray
@@ -58,10 +72,19 @@ class GaussianProcess:
     condition: float = np.nan
     alpha: np.ndarray = field(default=None, repr=False)
     beta: np.ndarray = field(default=None, repr=False)
+    kernel: Kernel = None
+    noise_free: bool = False
+    rows_given: int = 0
+    rounding_deg: float = np.nan
+    condition_raw: float = np.inf
+    repair: dict = None
+    length_max: float = LENGTH_RANGE[1]
     _factor: object = field(default=None, repr=False)
     _origin: np.ndarray = field(default=None, repr=False)
+    _spectrum: tuple = field(default=None, repr=False)
 
     @classmethod
+    @_blas.wrap(limits=1, user_api="blas")
     def fit(
         cls,
         features,
@@ -74,6 +97,12 @@ class GaussianProcess:
         seed=0,
         group_noise=False,
         length_max=LENGTH_RANGE[1],
+        kernel="rbf",
+        p=None,
+        exponent=None,
+        noise_free=False,
+        learn_rows=LEARN_ROWS,
+        rows_max=ROWS_MAX,
     ):
         """Fit to features [n, d] and gaze_deg [n, 2].
 
@@ -82,45 +111,30 @@ class GaussianProcess:
         hyper         use these parameters instead of optimising the likelihood
         length_max    longest length scale, in standard deviations of the channel
         restarts      random starting points beside the standard one, drawn from the seed
+        kernel, p, exponent  see kernels.kernel;  noise_free  the paper's form, noise_deg = 0
+        learn_rows    above it the likelihood is searched on that many rows, then polished on up to 2000
+        rows_max      above it the process keeps that many rows, evenly spread, and warns
         The result is a pure function of data and seed; samples are put in a canonical order first.
-        Raises CalibrationError for fewer samples than the mean needs, for nan or infinities, and when all
-        channels are constant. A constant channel is dropped with a warning.
+        Raises CalibrationError for fewer samples than the mean needs, for nan or infinities, when all channels
+        are constant, and when float64 cannot hold the answer. A constant channel is dropped with a warning.
         """
-        x, y = np.array(features, float), np.array(gaze_deg, float)
-        n = len(x)
-        if x.ndim != 2 or y.shape != (n, 2):
-            raise CalibrationError(
-                f"features {x.shape} and gaze {y.shape} do not fit together", "give [n, d] and [n, 2]"
-            )
-        if not (np.isfinite(x).all() and np.isfinite(y).all()):
-            raise CalibrationError("features or targets hold nan or infinity", "mark those rows valid = 0")
-        varying = np.ptp(x, axis=0) > 0 if n else np.zeros(x.shape[1], bool)
-        columns = _mean_columns(mean, int(varying.sum()))
-        if n < columns + 2:
-            raise CalibrationError(
-                f"{n} samples are too few for a {mean} mean in {x.shape[1]} channels",
-                f"give at least {columns + 2}",
-            )
-        if not varying.any():
-            raise CalibrationError(
-                "no channel changes between the targets", "check that the LEDs are connected and see the eye"
-            )
-        dropped = tuple(int(j) for j in np.flatnonzero(~varying))
-        if dropped:
-            warnings.warn(f"constant channel dropped: {', '.join(f's{j}' for j in dropped)}", stacklevel=2)
-        scale = np.ones(n) if noise_scale is None else np.array(noise_scale, float)
-        labels = np.arange(n) if groups is None else np.unique(groups, return_inverse=True)[1]
-        order = np.lexsort(np.column_stack([labels, y, x]).T)
-        x, y, scale, labels = x[order], y[order], scale[order], labels[order]
-        gp = cls(x, y, hyper, mean, scale, labels, dropped)
+        shape = make_kernel(kernel, p, exponent)
+        known = Samples.check(features, gaze_deg, noise_scale, groups, shape, mean, rows_max, depth=3)
+        gp = cls(known.x, known.y, hyper, mean, known.noise_scale, known.groups, known.dropped, kernel=shape)
+        gp.rows_given, gp.length_max = known.given, length_max
+        gp.noise_free = noise_free if hyper is None else hyper.noise_deg == 0
         if hyper is None:
-            gp.hyper = _optimise(gp, varying, restarts, seed, group_noise, length_max)
-        gp._solve(varying)
+            gp.hyper = gp._learn(restarts, seed, group_noise, learn_rows)
+        gp._solve()
         return gp
 
+    @_blas.wrap(limits=1, user_api="blas")
     def predict(self, features, return_std=False):
-        """Mean [m, 2] at features [m, d]; with return_std also the standard deviation [m] of f; degrees."""
-        features = np.asarray(features, float)
+        """Mean [m, 2] at features [m, d]; with return_std also the standard deviation [m] of f; degrees.
+
+        Raises CalibrationError for nan or infinities, and where the kernel's measure is not defined.
+        """
+        features = self._query(features)
         mean = np.empty((len(features), 2))
         std = np.empty(len(features))
         for rows in _blocks(len(features), len(self.x)):
@@ -128,46 +142,136 @@ class GaussianProcess:
             h = self._basis(features[rows])
             mean[rows] = k @ self.alpha + h @ self.beta
             if return_std:
+                k, prior = self._sound(k)
                 v = solve_triangular(self._factor[0], k.T, lower=True)
-                variance = self.hyper.signal_deg**2 - np.sum(v * v, axis=0)
+                variance = prior - np.sum(v * v, axis=0)
                 if h.shape[1]:
                     r = h.T - self._h_white.T @ v
                     variance += np.sum(solve_triangular(self._h_factor, r, trans="T") ** 2, axis=0)
                 std[rows] = np.sqrt(np.maximum(variance, 0.0))
         return (mean, std) if return_std else mean
 
+    @_blas.wrap(limits=1, user_api="blas")
+    def gradient(self, features):
+        """Derivative of the mean by the features, [m, 2, d], degrees per feature unit; 0 in dropped channels.
+
+        Where a kernel has a cusp (all but rbf, matern52 and cosine, at a training sample) the mean has no
+        derivative; that sample's own kernel then counts 0, the mean of both sides.
+        """
+        features = self._query(features)
+        out = np.zeros((len(features), 2, features.shape[1]))
+        used, own, length = np.isfinite(self.hyper.length), self._kept(self.x), self._lengths()
+        for rows in _blocks(len(features), len(self.x)):
+            part = self.kernel.slope(self._kept(features[rows]), own, length, self.alpha)
+            out[rows][:, :, used] = self.hyper.signal_deg**2 * part
+        if self.mean == "linear":
+            live = [j for j in range(features.shape[1]) if j not in self.dropped]
+            out[:, :, live] += (self.beta[1:] / self._origin[1, live, None]).T
+        return out
+
+    @_blas.wrap(limits=1, user_api="blas")
     def loo(self):
         """Leave-one-out in closed form, b refitted each time: (mean [n, 2], standard deviation [n]), degrees.
 
         In the order of self.x. R & W equations 5.10 to 5.12, with K^-1 replaced by its projection off h(x).
         """
-        p = _inverse(self._factor[0])
-        h = self._basis(self.x)
-        if h.shape[1]:
-            q = solve_triangular(self._h_factor, (p @ h).T, trans="T")
-            p = p - q.T @ q
+        p = self._projector()
         diagonal = np.diag(p)
         return self.y - p @ self.y / diagonal[:, None], np.sqrt(1.0 / diagonal)
 
+    @_blas.wrap(limits=1, user_api="blas")
     def loo_groups(self):
         """Leave-one-group-out in closed form: y - prediction [n, 2], the sample's whole group left out."""
-        p = _inverse(self._factor[0])
-        h = self._basis(self.x)
-        if h.shape[1]:
-            q = solve_triangular(self._h_factor, (p @ h).T, trans="T")
-            p = p - q.T @ q
-        weighted, residual = p @ self.y, np.empty_like(self.y)
+        p = self._projector()
+        weighted, miss = p @ self.y, np.empty_like(self.y)
         for label in np.unique(self.groups):
             rows = np.flatnonzero(self.groups == label)
-            residual[rows] = np.linalg.solve(p[np.ix_(rows, rows)], weighted[rows])
-        return residual
+            miss[rows] = np.linalg.solve(p[np.ix_(rows, rows)], weighted[rows])
+        return miss
+
+    @_blas.wrap(limits=1, user_api="blas")
+    def likelihood_gap(self, restarts=8, seed=1):
+        """Log likelihood of the best of many tight searches, less that of the hyper-parameters in use: nats, >= 0.
+
+        For a report, not for use: minutes at 2000 rows. The searches run on a part of the rows; the best three
+        and the parameters in use are then followed to convergence on up to 2000 of them.
+        """
+        grouped = self.hyper.group_deg > 0
+        problem, level, unit = self._problem(grouped)
+        deviations = [self.hyper.signal_deg, self.hyper.noise_deg, self.hyper.group_deg]
+        used = [True, not self.noise_free, grouped]
+        here = np.log(np.r_[self._lengths() / unit, np.array(deviations)[used] / level])
+        return thorough(problem, here, self.length_max, restarts, seed)
+
+    def describe(self):
+        """The process in a dict that JSON can hold: kernel, hyper-parameters, fit, and what was done to the matrix."""
+        error = self.y - self.loo()[0]
+        named = self.kernel.name in ("minkowski", "laplace")
+        certain = self.condition_raw <= CONDITION_MOST
+        beyond = f"without jitter beyond {CONDITION_MOST:.1e}, the most that float64 can tell: it may be any larger"
+        return {
+            "kernel": self.kernel.name,
+            "formula": f"{self.hyper.signal_deg:.6g}^2 {self.kernel.formula()}",
+            "p": None if not named else "inf" if np.isinf(self.kernel.p) else float(self.kernel.p),
+            "positive_definite": bool(self.kernel.definite(int(np.isfinite(self.hyper.length).sum()))),
+            "length": [float(v) if np.isfinite(v) else None for v in self.hyper.length],
+            "length_unit": self.kernel.length_unit,
+            "signal_deg": float(self.hyper.signal_deg),
+            "noise_deg": float(self.hyper.noise_deg),
+            "group_deg": float(self.hyper.group_deg),
+            "mean": self.mean,
+            "noise_free": bool(self.noise_free),
+            "lml": self.lml,
+            "loo_rms_deg": float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
+            "condition": self.condition,
+            "condition_raw": self.condition_raw if certain else None,
+            "condition_note": "" if certain else beyond,
+            "jitter": self.jitter,
+            "jitter_deg": self._jitter_deg(),
+            "rounding_deg": self.rounding_deg,
+            "repair": self.repair,
+            "rows": len(self.x),
+            "rows_given": self.rows_given,
+            "dropped": list(self.dropped),
+        }
+
+    def _query(self, features):
+        features = np.asarray(features, float)
+        if features.ndim != 2 or features.shape[1] != self.x.shape[1]:
+            raise CalibrationError(
+                f"features {features.shape} do not fit a process of {self.x.shape[1]} channels",
+                f"give [m, {self.x.shape[1]}]",
+            )
+        if not np.isfinite(features).all():
+            raise CalibrationError("features hold nan or infinity", "leave those rows out")
+        self.kernel.check(self._kept(features))
+        return features
+
+    def _kept(self, features):
+        """The channels that the kernel uses, as an array of its own."""
+        return np.ascontiguousarray(features[:, np.isfinite(self.hyper.length)])
+
+    def _lengths(self):
+        kept = self.hyper.length[np.isfinite(self.hyper.length)]
+        return kept if self.kernel.per_channel else kept[:1]
 
     def _kernel(self, features):
-        scaled, own = features / self.hyper.length, self.x / self.hyper.length
-        centre = own.mean(axis=0)  # the squared distance below cancels; keep the numbers small
-        scaled, own = scaled - centre, own - centre
-        d2 = np.sum(scaled**2, 1)[:, None] + np.sum(own**2, 1) - 2.0 * scaled @ own.T
-        return self.hyper.signal_deg**2 * np.exp(-0.5 * np.maximum(d2, 0.0))
+        value = self.kernel.value(self._kept(features), self._kept(self.x), self._lengths())
+        return self.hyper.signal_deg**2 * value
+
+    def _sound(self, k):
+        """Covariances [m, n] with the data, and variances [m], of the process; k from `_kernel`.
+
+        A repaired process is the one whose covariance is k(x, X) K+^-1 k(X, x'), K+ the repaired matrix on its
+        range (Nystroem's extension), plus what of s^2 that leaves out, as noise of its own at each point. It is
+        positive definite everywhere and equals K+ on the data, so that a variance cannot be negative.
+        """
+        s2 = self.hyper.signal_deg**2
+        if self._spectrum is None:
+            return k, s2
+        values, vectors = self._spectrum
+        along = k @ vectors
+        return along @ vectors.T, np.maximum(s2, np.sum(along * along / values, axis=1))
 
     def _basis(self, features):
         if self.mean == "zero":
@@ -178,19 +282,75 @@ class GaussianProcess:
         kept = [j for j in range(features.shape[1]) if j not in self.dropped]
         return np.hstack([one, (features[:, kept] - self._origin[0, kept]) / self._origin[1, kept]])
 
-    def _solve(self, varying):
-        x, hyper, n = self.x, self.hyper, len(self.x)
-        self._origin = np.stack([x.mean(axis=0), np.where(varying, x.std(axis=0), 1.0)])
+    def _projector(self):
+        p = inverse(self._factor[0])
+        h = self._basis(self.x)
+        if h.shape[1]:
+            q = solve_triangular(self._h_factor, (p @ h).T, trans="T")
+            p = p - q.T @ q
+        return p
+
+    def _problem(self, group_noise):
+        """(Likelihood of the data, level [deg] of its gaze, natural units [L] in the hyper-parameters' units)."""
+        live = [j for j in range(self.x.shape[1]) if j not in self.dropped]
+        z, unit, in_features = self.kernel.natural(self.x[:, live])
+        level = float(np.sqrt(np.mean((self.y - self.y.mean(axis=0)) ** 2))) or 1.0
+        one = np.ones((len(z), 1))
+        x = self.x[:, live]
+        h = {"zero": lambda: one[:, :0], "constant": lambda: one}.get(
+            self.mean, lambda: np.hstack([one, (x - x.mean(axis=0)) / x.std(axis=0)])
+        )()
+        scale, groups = self.noise_scale, self.groups
+        args = self.kernel, z, unit, self.y / level, h, scale, groups, self.noise_free, group_noise
+        return Likelihood(*args), level, in_features
+
+    def _learn(self, restarts, seed, group_noise, learn_rows):
+        problem, level, unit = self._problem(group_noise)
+        theta = learn(problem, self.length_max, restarts, seed, learn_rows)
+        value = np.exp(theta)
+        length = np.full(self.x.shape[1], np.inf)
+        length[[j for j in range(len(length)) if j not in self.dropped]] = value[: len(unit)] * unit
+        rest = [float(v * level) for v in value[len(unit) :]]
+        noise = 0.0 if self.noise_free else rest[1]
+        return Hyper(length, rest[0], noise, rest[-1] if group_noise else 0.0)
+
+    def _solve(self):
+        x, hyper = self.x, self.hyper
+        deviation = x.std(axis=0)
+        deviation[list(self.dropped)] = 1.0
+        self._origin = np.stack([x.mean(axis=0), deviation])
         cov = self._kernel(x)
         cov = 0.5 * (cov + cov.T)
         np.fill_diagonal(cov, hyper.signal_deg**2)
-        cov[np.diag_indices(n)] += hyper.noise_deg**2 * self.noise_scale
+        if not self.kernel.definite(int(np.isfinite(hyper.length).sum())):
+            cov = self._repaired(cov)
+        cov[np.diag_indices(len(x))] += hyper.noise_deg**2 * self.noise_scale
         if hyper.group_deg > 0:
             cov += hyper.group_deg**2 * (self.groups[:, None] == self.groups)
-        self._factor, self.jitter = _cholesky(cov)
-        lower = self._factor[0]
+        left = JITTERS
+        while left:
+            self._factor, self.jitter = cholesky(cov, left)
+            left = [jitter for jitter in left if jitter > self.jitter]
+            self._weigh(cov)
+            self.condition_raw = self.condition if self.jitter == 0 else self.condition_raw
+            if self.rounding_deg <= ROUNDING_MOST_DEG:
+                break
+        else:
+            raise CalibrationError(
+                f"float64 cannot hold these weights: predictions could be off by {self.rounding_deg:.1g} deg",
+                "allow more noise, or shorter length scales",
+            )
+        if self.jitter and not self.noise_free:
+            warnings.warn(
+                f"the covariance matrix is singular to float64: noise of {self._jitter_deg():.2g} deg was added",
+                stacklevel=5,
+            )
+
+    def _weigh(self, cov):
+        """Weights, likelihood, condition and error bound, from the factor."""
+        lower, n = self._factor[0], len(self.x)
         white_y = solve_triangular(lower, self.y, lower=True)
-        h = self._basis(x)
+        h = self._basis(self.x)
         self.beta = np.zeros((h.shape[1], 2))
         if h.shape[1]:
             self._h_white = solve_triangular(lower, h, lower=True)
@@ -202,134 +362,63 @@ class GaussianProcess:
                 )
             self.beta = solve_triangular(self._h_factor, q.T @ white_y)
             white_y = white_y - self._h_white @ self.beta
-        self.alpha = solve_triangular(lower, white_y, lower=True, trans="T")
+        alpha = solve_triangular(lower, white_y, lower=True, trans="T")
         logdet = 2 * np.sum(np.log(np.diag(lower)))
         self.lml = float(-0.5 * np.sum(white_y**2) - logdet - n * np.log(2 * np.pi))
-        self.condition = _condition(cov, self._factor)
+        largest, smallest = extremes(self._factor)
+        self.condition = largest / smallest
+        lost = smallest <= 4 * EPS * largest  # no more than Cholesky's own rounding
+        self.rounding_deg = np.inf if lost else self._rounding(cov, alpha, h)
+        self.alpha = alpha if self._spectrum is None else self._spectrum[1] @ (self._spectrum[1].T @ alpha)
 
+    def _rounding(self, cov, alpha, h):
+        """Bound of a prediction's error at the data and between them (PROBES places), degrees.
 
-def _mean_columns(mean, channels):
-    try:
-        return {"zero": 0, "constant": 1, "linear": 1 + channels}[mean]
-    except KeyError:
-        raise ValueError(f"mean {mean!r} is none of zero, constant, linear") from None
+        With r what the weights in use leave of the exact K a + H b = y, the kernel's own rounding included, and t
+        what they leave of H' a = 0, the mean at x is off by w' r + m' t: w are the weights of the data in the mean
+        at x, m the multipliers of its columns. Then the rounding of the last sum.
+        """
+        s2, size = self.hyper.signal_deg**2, np.abs(alpha)
+        relative, absolute = self.kernel.rounding(self._kept(self.x), self._lengths())
+        sums, total = np.abs(cov) @ size, size.sum(axis=0)
+        miss = np.abs(residual(cov, self.jitter, alpha, self.y - h @ self.beta))
+        miss += EPS * (relative * sums + absolute * s2 * total + 4 * np.abs(self.y))
+        if self._spectrum is not None:
+            miss += 30 * EPS * self._spectrum[0][-1] * np.sqrt(np.mean(size**2, axis=0))
+        near = self.x[spread(len(self.x), PROBES)]
+        probes = np.vstack([near, 0.5 * (near[1:] + near[:-1])])
+        v = solve_triangular(self._factor[0], self._sound(self._kernel(probes))[0].T, lower=True)
+        off = np.zeros((len(probes), 2))
+        if h.shape[1]:
+            lack = solve_triangular(self._h_factor, self._basis(probes).T - self._h_white.T @ v, trans="T")
+            multiplier = solve_triangular(self._h_factor, lack)
+            v = v + self._h_white @ multiplier
+            off = np.abs(multiplier.T) @ (np.abs(h.T @ alpha) + len(h) * EPS * (np.abs(h.T) @ size))
+        off += np.abs(solve_triangular(self._factor[0], v, lower=True, trans="T").T) @ miss
+        last = EPS * ((relative + len(size)) * sums.max(axis=0) + absolute * s2 * total)
+        return float(np.max(off + last) + 8 * EPS * np.abs(self.y).max())
 
+    def _repaired(self, cov):
+        """cov made a covariance matrix; fills `repair` and the spectrum that predictions need."""
+        cov, values, vectors = repaired(cov)
+        kept = values > RANK_TOLERANCE * values[-1]
+        removed = float(np.abs(values[values < 0]).sum() / np.abs(values).sum())
+        least = float(values[0] / self.hyper.signal_deg**2)
+        self._spectrum = values[kept], vectors[:, kept]
+        self.repair = {
+            "words": f"the Minkowski distance of p = {self.kernel.p:g} gives no covariance in 3 or more channels: "
+            f"{int((values < 0).sum())} negative eigenvalues, {100 * removed:.2g} % of the spectrum, were removed",
+            "smallest_eigenvalue": least,
+            "removed_share": removed,
+            "rank": int(kept.sum()),
+        }
+        warnings.warn(self.repair["words"], stacklevel=6)
+        return cov
 
-def _optimise(gp, varying, restarts, seed, group_noise, length_max):
-    """Maximise the marginal likelihood over log length, signal, noise (and group) deviations."""
-    x = gp.x[:, varying]
-    spread = x.std(axis=0)
-    z = (x - x.mean(axis=0)) / spread
-    level = float(np.sqrt(np.mean((gp.y - gp.y.mean(axis=0)) ** 2))) or 1.0
-    y, d, n = gp.y / level, z.shape[1], len(z)
-    one = np.ones((n, 1))
-    h = {"zero": one[:, :0], "constant": one, "linear": np.hstack([one, z])}[gp.mean]
-    squares = np.stack([(z[:, j, None] - z[:, j]) ** 2 for j in range(d)])
-    same = (gp.groups[:, None] == gp.groups).astype(float) if group_noise else None
-    scales = [SIGNAL_RANGE, NOISE_RANGE] + [NOISE_RANGE] * bool(group_noise)
-    bounds = np.log([(LENGTH_RANGE[0], length_max)] * d + scales)
-
-    def objective(theta):
-        value, slope = _likelihood(theta, squares, y, h, gp.noise_scale, same)
-        return -value, -slope
-
-    start = np.log(np.r_[np.full(d, min(3.0, 0.7 * length_max)), 3.0, 0.05, [0.03] * bool(group_noise)])
-    rng = np.random.default_rng([0x6770, seed])
-    best = None
-    for trial in range(restarts + 1):
-        guess = start if trial == 0 else start + START_SPREAD * rng.standard_normal(len(start))
-        found = minimize(
-            objective,
-            np.clip(guess, *bounds.T),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=bounds,
-            options={"maxiter": 200},
-        )
-        if best is None or found.fun < best.fun - 1e-6:
-            best = found
-    value = np.exp(best.x)
-    length = np.full(gp.x.shape[1], np.inf)
-    length[varying] = value[:d] * spread
-    return Hyper(
-        length,
-        float(value[d] * level),
-        float(value[d + 1] * level),
-        float(value[d + 2] * level) if group_noise else 0.0,
-    )
-
-
-def _likelihood(theta, squares, y, h, noise_scale, same):
-    """Log marginal likelihood of both outputs, and its gradient in theta (R & W equation 5.9).
-
-    theta = log of (length [d], signal, noise[, group]); squares [d, n, n] squared differences per channel.
-    b is at its generalised-least-squares value, where the likelihood is stationary in b.
-    """
-    d, n, _ = squares.shape
-    inverse_l2 = np.exp(-2 * theta[:d])
-    k = np.exp(2 * theta[d]) * np.exp(-0.5 * np.tensordot(inverse_l2, squares, 1))
-    noise = np.exp(2 * theta[d + 1]) * noise_scale
-    cov = k.copy()
-    cov[np.diag_indices(n)] += noise
-    if same is not None:
-        cov += np.exp(2 * theta[d + 2]) * same
-    try:
-        factor, _ = _cholesky(cov)
-    except CalibrationError:
-        return -1e25, np.zeros_like(theta)
-    residual = y
-    if h.shape[1]:
-        white = solve_triangular(factor[0], h, lower=True)
-        b = np.linalg.lstsq(white, solve_triangular(factor[0], y, lower=True), rcond=1e-12)[0]
-        residual = y - h @ b
-    alpha = cho_solve(factor, residual)
-    value = -0.5 * np.sum(residual * alpha) - 2 * np.sum(np.log(np.diag(factor[0]))) - n * np.log(2 * np.pi)
-    m = alpha @ alpha.T - 2 * _inverse(factor[0])
-    mk = m * k
-    slope = np.empty_like(theta)
-    for j in range(d):
-        slope[j] = 0.5 * inverse_l2[j] * np.sum(mk * squares[j])
-    slope[d] = np.sum(mk)
-    slope[d + 1] = np.sum(np.diag(m) * noise)
-    if same is not None:
-        slope[d + 2] = np.exp(2 * theta[d + 2]) * np.sum(m * same)
-    return value, slope
-
-
-def _cholesky(cov):
-    """Lower Cholesky factor of cov with the least jitter that works: (cho_factor tuple, relative jitter)."""
-    diagonal = float(np.mean(np.diag(cov)))
-    for jitter in JITTERS:
-        try:
-            c, lower = cho_factor(
-                cov + jitter * diagonal * np.eye(len(cov)) if jitter else cov, lower=True, check_finite=False
-            )
-        except np.linalg.LinAlgError:
-            continue
-        return (np.tril(c), lower), jitter
-    raise CalibrationError(
-        "the covariance matrix is numerically singular", "remove duplicate samples or allow more noise"
-    )
-
-
-def _inverse(lower):
-    """K^-1 from its Cholesky factor, for traces and diagonals that need its entries (never for a solve)."""
-    inverse, status = lapack.dpotri(lower, lower=1)
-    assert status == 0
-    return np.tril(inverse) + np.tril(inverse, -1).T
-
-
-def _condition(cov, factor, steps=40):
-    """Condition number in the 2-norm by power iteration on K and K^-1: a lower bound, a few percent off."""
-    rng = np.random.default_rng(1)
-    largest = smallest = 1.0
-    v = rng.standard_normal(len(cov))
-    w = v.copy()
-    for _ in range(steps):
-        v = cov @ (v / np.linalg.norm(v))
-        w = cho_solve(factor, w / np.linalg.norm(w))
-        largest, smallest = np.linalg.norm(v), np.linalg.norm(w)
-    return float(largest * smallest)
+    def _jitter_deg(self):
+        """Standard deviation of the noise that the jitter amounts to."""
+        noise2 = self.hyper.noise_deg**2 * np.mean(self.noise_scale) + self.hyper.group_deg**2
+        return float(np.sqrt(self.jitter * (self.hyper.signal_deg**2 + noise2)))
 
 
 def _blocks(n, width, entries=4_000_000):

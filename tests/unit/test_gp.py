@@ -68,28 +68,6 @@ def test_optimised_likelihood_is_not_below_scikit_learns():
     assert gp.lml > twin.log_marginal_likelihood_value_ - 0.5
 
 
-@pytest.mark.parametrize(
-    "mean, grouped", [("zero", False), ("constant", False), ("linear", False), ("linear", True)]
-)
-def test_gradient_equals_finite_differences(mean, grouped):
-    rng = np.random.default_rng(2)
-    n, d = 25, 3
-    z, y = rng.standard_normal((n, d)), rng.standard_normal((n, 2))
-    h = {"zero": np.empty((n, 0)), "constant": np.ones((n, 1)), "linear": np.hstack([np.ones((n, 1)), z])}[
-        mean
-    ]
-    squares = np.stack([(z[:, j, None] - z[:, j]) ** 2 for j in range(d)])
-    scale = rng.uniform(0.5, 2, n)
-    same = (np.arange(n)[:, None] // 3 == np.arange(n) // 3).astype(float) if grouped else None
-    theta = np.log(np.r_[1.1, 0.8, 2.0, 1.5, 0.3, [0.2] * grouped])
-    _, slope = module._likelihood(theta, squares, y, h, scale, same)
-    for i in range(len(theta)):
-        step = np.zeros_like(theta)
-        step[i] = 1e-5
-        up, down = (module._likelihood(theta + s, squares, y, h, scale, same)[0] for s in (step, -step))
-        assert slope[i] == pytest.approx((up - down) / 2e-5, rel=1e-6, abs=1e-6)
-
-
 @pytest.mark.parametrize("mean", ["zero", "constant", "linear"])
 def test_leave_one_out_equals_brute_force(mean):
     features, gaze = data(30)
@@ -236,8 +214,10 @@ def test_all_targets_on_a_line_and_all_targets_equal():
 
 def test_condition_number_near_1e16_still_predicts():
     features, gaze = data(200, noise=0.0)
-    gp = GaussianProcess.fit(features, gaze, mean="zero", hyper=Hyper(HYPER.length * 50, 1e4, 1e-4))
-    assert gp.condition > 1e11 and np.isfinite(gp.predict(features)).all()
+    with pytest.warns(UserWarning, match="singular to float64"):
+        gp = GaussianProcess.fit(features, gaze, mean="zero", hyper=Hyper(HYPER.length * 50, 1e4, 1e-4))
+    assert gp.jitter > 0 and gp.condition_raw > 1e15 and "float64" in gp.describe()["condition_note"]
+    assert np.isfinite(gp.predict(features)).all()
 
 
 def test_prediction_in_blocks_is_prediction_at_once(monkeypatch):

@@ -1,0 +1,483 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The hard cases of a calibration's mathematics, each with what the process must do; references in 60 digits.
+
+The reference solves the same equations by Gaussian elimination in decimal arithmetic, from the definitions of the
+kernels; it shares no line with the product.
+"""
+
+import json
+import subprocess
+import sys
+import warnings
+from decimal import Decimal, getcontext
+
+import numpy as np
+import pytest
+
+from sparsegaze.errors import CalibrationError
+from sparsegaze.gp import GaussianProcess, Hyper
+
+getcontext().prec = 60
+LENGTH = np.array([900.0, 1200, 700, 1500, 1000, 800])
+KERNELS = [
+    ("rbf", None),
+    ("matern52", None),
+    ("laplace", None),
+    ("minkowski", 0.5),
+    ("minkowski", 1.5),
+    ("canberra", None),
+    ("cosine", None),
+]
+every_kernel = pytest.mark.parametrize("name, p", KERNELS)
+
+
+def recording(n, seed=0, noise_deg=0.2, step_noise=5.0):
+    """Six smooth channels over +-20 deg of a simulated eye: (features [n, 6], gaze [n, 2])."""
+    rng = np.random.default_rng([11, seed])
+    gaze = rng.uniform(-20, 20, (n, 2))
+    angle = np.arange(6) * np.pi / 3
+    place = 25 * np.stack([np.cos(angle), np.sin(angle)], 1)
+    bump = np.exp(-((gaze[:, None] - place) ** 2).sum(-1) / (2 * 18.0**2))
+    features = 45000 + 4096 * np.log2(1 - 0.5 * bump) + step_noise * rng.standard_normal((n, 6))
+    return features, gaze + noise_deg * rng.standard_normal((n, 2))
+
+
+def quietly(*args, **kwargs):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return GaussianProcess.fit(*args, **kwargs)
+
+
+def exactly(values):
+    return [Decimal(float(v)) for v in values]
+
+
+def decimal_kernel(name, p, a, b, length):
+    gaps = [abs(u - v) for u, v in zip(a, b)]
+    scaled = [g / w for g, w in zip(gaps, length)]
+    if name == "rbf":
+        return (-sum(g * g for g in scaled) / 2).exp()
+    if name == "matern52":
+        r = (5 * sum(g * g for g in scaled)).sqrt()
+        return (1 + r + r * r / 3) * (-r).exp()
+    if name == "canberra":
+        return (-sum(g / (u + v) / w for g, u, v, w in zip(gaps, a, b, length))).exp()
+    if name == "cosine":
+        norm = (sum(u * u for u in a) * sum(v * v for v in b)).sqrt()
+        return ((sum(u * v for u, v in zip(a, b)) / norm - 1) / length[0] ** 2).exp()
+    power = Decimal(1 if name == "laplace" else p)
+    return (-sum((g.ln() * power).exp() if g else Decimal(0) for g in scaled)).exp()
+
+
+def decimal_solve(matrix, right):
+    """Gaussian elimination with pivoting."""
+    n, rows = len(matrix), [a[:] + b[:] for a, b in zip(matrix, right)]
+    for i in range(n):
+        pivot = max(range(i, n), key=lambda r: abs(rows[r][i]))
+        rows[i], rows[pivot] = rows[pivot], rows[i]
+        for r in range(i + 1, n):
+            f = rows[r][i] / rows[i][i]
+            if f:
+                rows[r] = [u - f * v for u, v in zip(rows[r], rows[i])]
+    result = [None] * n
+    for i in reversed(range(n)):
+        done = [sum(rows[i][c] * result[c][o] for c in range(i + 1, n)) for o in range(len(right[0]))]
+        result[i] = [(rows[i][n + o] - d) / rows[i][i] for o, d in enumerate(done)]
+    return result
+
+
+def reference(gp, query, p=None):
+    """The mean [m, 2] of gp at query in 60 digits, mean zero or constant, the jitter it reports included."""
+    length = exactly(gp.hyper.length)
+    s2, noise2 = Decimal(float(gp.hyper.signal_deg)) ** 2, Decimal(float(gp.hyper.noise_deg)) ** 2
+    x = [exactly(row) for row in gp.x]
+    k = [[s2 * decimal_kernel(gp.kernel.name, p, a, b, length) for b in x] for a in x]
+    for i, scale in enumerate(exactly(gp.noise_scale)):
+        k[i][i] += noise2 * scale
+    extra = Decimal(gp.jitter) * sum(k[i][i] for i in range(len(x))) / len(x)
+    for i in range(len(x)):
+        k[i][i] += extra
+    right, one = [exactly(row) for row in gp.y], [Decimal(1)] if gp.mean == "constant" else []
+    if one:
+        k = [row + one for row in k] + [one * len(x) + [Decimal(0)]]
+        right.append([Decimal(0)] * 2)
+    weights = decimal_solve(k, right)
+    rows = [[s2 * decimal_kernel(gp.kernel.name, p, exactly(q), b, length) for b in x] + one for q in query]
+    return np.array([[float(sum(u * w[o] for u, w in zip(row, weights))) for o in (0, 1)] for row in rows])
+
+
+def hyper_for(name, scale, signal_deg, noise_deg):
+    length = LENGTH * {"canberra": 1e-5}.get(name, 1.0) * scale
+    return Hyper(np.full(6, 0.05 * scale) if name == "cosine" else length, signal_deg, noise_deg)
+
+
+@pytest.mark.parametrize("mean", ["zero", "constant"])
+@pytest.mark.parametrize("signal_deg, noise_deg", [(30.0, 0.3), (30.0, 1e-3), (1e3, 1e-6), (30.0, 0.0)])
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 30.0, 1e3])
+@every_kernel
+def test_length_scales_from_1e_3_to_1e3_agree_with_60_digits_within_the_stated_bound(
+    name, p, scale, signal_deg, noise_deg, mean
+):
+    features, gaze = recording(18)
+    query = np.vstack([recording(4, seed=5)[0], features[:2]])
+    gp = quietly(features, gaze, mean=mean, hyper=hyper_for(name, scale, signal_deg, noise_deg), kernel=name, p=p)
+    error = np.abs(gp.predict(query) - reference(gp, query, p)).max()
+    assert error <= gp.rounding_deg <= 0.01
+
+
+def test_the_bound_is_not_idle():
+    """Rounded to single precision the weights break the bound: it can tell a wrong answer from a right one."""
+    features, gaze = recording(18)
+    gp = quietly(features, gaze, mean="zero", hyper=Hyper(LENGTH * 3, 30.0, 0.01))
+    wrong = gp._kernel(features) @ gp.alpha.astype(np.float32)
+    assert np.abs(wrong - reference(gp, features)).max() > gp.rounding_deg
+    assert np.abs(gp.predict(features) - reference(gp, features)).max() <= gp.rounding_deg
+
+
+@every_kernel
+def test_duplicates_and_near_duplicates_of_a_dense_pursuit(name, p):
+    """Frames 1e-9 to 1 steps apart with slightly different labels: noise explains them, nothing blows up."""
+    features, gaze = recording(25)
+    rng = np.random.default_rng(3)
+    rows = np.repeat(np.arange(25), 4)
+    apart = np.array([0.0, 1e-9, 1e-3, 1.0])[np.tile(np.arange(4), 25)][:, None]
+    dense = features[rows] + apart * rng.standard_normal((100, 6))
+    labels = gaze[rows] + 0.3 * rng.standard_normal((100, 2))
+    gp = quietly(dense, labels, mean="constant", kernel=name, p=p, restarts=0)
+    assert 0.15 < gp.hyper.noise_deg < 0.6 and gp.rounding_deg < 0.01
+    assert np.sqrt(np.mean((gp.predict(features) - labels.reshape(25, 4, 2).mean(axis=1)) ** 2)) < 0.4
+
+
+@every_kernel
+def test_exact_duplicates_without_noise_take_a_jitter_that_is_reported(name, p):
+    features, gaze = recording(9)
+    gp = GaussianProcess.fit(
+        np.repeat(features, 2, axis=0),
+        np.repeat(gaze, 2, axis=0),
+        mean="zero",
+        hyper=hyper_for(name, 1.0, 30.0, 0.0),
+        kernel=name,
+        p=p,
+    )
+    told = gp.describe()
+    assert gp.jitter > 0 and told["condition_raw"] is None and "beyond 4.5e+14" in told["condition_note"]
+    assert told["jitter_deg"] == pytest.approx(30.0 * np.sqrt(gp.jitter))
+    assert np.abs(gp.predict(features) - gaze).max() < 0.01
+    assert np.abs(gp.predict(features) - reference(gp, features, p)).max() <= gp.rounding_deg
+
+
+def test_the_condition_number_is_right_up_to_where_float64_can_tell_and_named_beyond():
+    """Two samples at a distance have K = s^2 [[1, c], [c, 1]], condition (1 + c) / (1 - c), known in closed form."""
+    for gap, expected_known in ((1.0, True), (1e-3, True), (1e-6, True), (3e-7, True), (1e-8, False), (0.0, False)):
+        x = np.array([[0.0], [gap], [40.0]])
+        gp = quietly(x, np.zeros((3, 2)) + [[1.0], [1.0], [-1.0]], mean="zero", hyper=Hyper(np.ones(1), 1.0, 0.0))
+        c = np.exp(-0.5 * gap**2)
+        told = gp.describe()
+        if expected_known:
+            expected = (1 + c) / -np.expm1(-0.5 * gap**2)
+            assert gp.condition_raw == pytest.approx(expected, rel=max(1e-9, 1e-16 * expected * 4))
+            assert told["condition_raw"] == gp.condition_raw and told["condition_note"] == ""
+        else:
+            assert told["condition_raw"] is None and "4.5e+14" in told["condition_note"]
+            assert gp.jitter > 0 and gp.condition < 1e13
+
+
+@pytest.mark.parametrize("noise_deg", [1e-2, 1e-4, 1e-6, 1e-8])
+def test_condition_numbers_to_1e16_and_beyond_predict_within_the_bound(noise_deg):
+    features, gaze = recording(22)
+    gp = quietly(features, gaze, mean="zero", hyper=Hyper(LENGTH * 100, 3e2, noise_deg))
+    assert gp.condition_raw > 0.5 * 22 * (3e2 / noise_deg) ** 2 or gp.condition_raw > 1e15
+    query = recording(5, seed=8)[0]
+    assert np.abs(gp.predict(query) - reference(gp, query)).max() <= gp.rounding_deg <= 0.01
+
+
+@every_kernel
+def test_the_papers_form_without_noise_learns_interpolates_and_reports(name, p):
+    features, gaze = recording(60, noise_deg=0.0, step_noise=0.0)
+    gp = GaussianProcess.fit(features, gaze, mean="zero", kernel=name, p=p, noise_free=True, restarts=0)
+    told = gp.describe()
+    assert gp.noise_free and gp.hyper.noise_deg == 0 and told["noise_free"]
+    assert np.abs(gp.predict(features) - gaze).max() < max(0.01, 30 * gp.rounding_deg)
+    assert gp.condition > 1 and gp.rounding_deg <= 0.01 and np.isfinite(gp.lml)
+    again = GaussianProcess.fit(features, gaze, mean="zero", kernel=name, p=p, hyper=gp.hyper)
+    np.testing.assert_array_equal(again.predict(features), gp.predict(features))
+
+
+def test_noise_that_differs_between_samples_is_weighed():
+    features, gaze = recording(40)
+    scale = np.where(np.arange(40) % 2, 1e6, 1.0)
+    gp = quietly(features, gaze, noise_scale=scale, mean="constant", hyper=Hyper(LENGTH, 30.0, 0.3))
+    few = quietly(features[::2], gaze[::2], mean="constant", hyper=gp.hyper)
+    np.testing.assert_allclose(gp.predict(features), few.predict(features), atol=0.1)
+    assert np.abs(gp.predict(features) - reference(gp, features)).max() <= gp.rounding_deg
+
+
+@pytest.mark.parametrize("scale", [[1.0], [-1.0] * 20, [np.nan] * 20])
+def test_a_noise_scale_that_is_no_variance_is_refused(scale):
+    with pytest.raises(CalibrationError, match="noise_scale"):
+        GaussianProcess.fit(*recording(20), noise_scale=np.array(scale))
+
+
+@every_kernel
+@pytest.mark.parametrize("dead", [65535.0, 0.0])
+def test_a_constant_channel_is_dropped_with_a_warning_whatever_the_kernel(name, p, dead):
+    features, gaze = recording(40)
+    features[:, 4] = dead
+    with pytest.warns(UserWarning, match="constant channel dropped: s4"):
+        gp = GaussianProcess.fit(features, gaze, mean="constant", kernel=name, p=p, restarts=0)
+    without = GaussianProcess.fit(np.delete(features, 4, 1), gaze, mean="constant", kernel=name, p=p, restarts=0)
+    changed = features.copy()
+    changed[:, 4] = 1234.0
+    np.testing.assert_allclose(gp.predict(changed), without.predict(np.delete(features, 4, 1)), atol=1e-6)
+    assert gp.describe()["length"][4] is None and np.all(gp.gradient(features)[:, :, 4] == 0)
+
+
+@every_kernel
+@pytest.mark.parametrize("stuck", [65535.0, 0.0])
+def test_a_led_that_saturates_or_dies_on_half_of_the_rows(name, p, stuck):
+    """The other five channels carry the gaze: held-out error stays below a degree and a half, on both halves."""
+    features, gaze = recording(160)
+    features[:80, 2] = stuck
+    held = np.r_[70:80, 150:160]
+    kept = np.setdiff1d(np.arange(160), held)
+    gp = quietly(features[kept], gaze[kept], mean="constant", kernel=name, p=p, restarts=0)
+    error = np.linalg.norm(gp.predict(features[held]) - gaze[held], axis=1)
+    limit = 8.0 if name == "cosine" else 2.5 if name in ("laplace", "canberra", "minkowski") else 1.5
+    assert np.sqrt(np.mean(error**2)) < limit and gp.rounding_deg < 0.01
+
+
+@pytest.mark.parametrize("name, p", [case for case in KERNELS if case[0] not in ("canberra", "cosine")])
+def test_channels_of_scales_from_1e_3_to_1e6(name, p):
+    features, gaze = recording(50)
+    scale = np.array([1.0, 1e-3, 1e6, 1e3, 1e-2, 1e5])
+    query = recording(20, seed=3)[0]
+    plain = quietly(features, gaze, mean="constant", kernel=name, p=p, restarts=0)
+    scaled = quietly(features * scale, gaze, mean="constant", kernel=name, p=p, restarts=0)
+    np.testing.assert_allclose(scaled.predict(query * scale), plain.predict(query), atol=0.02)
+
+
+def test_canberra_does_not_see_the_scale_of_a_channel_at_all():
+    features, gaze = recording(40)
+    scale = np.array([1.0, 1e-3, 1e6, 1e3, 1e-2, 1e5])
+    hyper = Hyper(LENGTH * 1e-5, 20.0, 0.3)
+    a = GaussianProcess.fit(features, gaze, mean="zero", hyper=hyper, kernel="canberra")
+    b = GaussianProcess.fit(features * scale, gaze, mean="zero", hyper=hyper, kernel="canberra")
+    np.testing.assert_allclose(a.predict(features), b.predict(features * scale), atol=1e-8)
+
+
+@every_kernel
+def test_one_outlier_of_100_sigma_is_the_worst_left_out_and_its_removal_heals(name, p):
+    features, gaze = recording(60)
+    clean = quietly(features, gaze, mean="constant", kernel=name, p=p, restarts=0)
+    sigma = clean.loo()[1].mean()
+    bad = gaze.copy()
+    bad[7] += [100 * sigma, 0]
+    gp = quietly(features, bad, mean="constant", kernel=name, p=p, hyper=clean.hyper)
+    predicted, spread = gp.loo()
+    miss = np.linalg.norm(gp.y - predicted, axis=1) / spread
+    worst = int(np.argmax(miss))
+    np.testing.assert_array_equal(gp.y[worst], bad[7])
+    assert miss[worst] > 25
+    healed = quietly(np.delete(features, 7, 0), np.delete(bad, 7, 0), mean="constant", kernel=name, p=p, hyper=gp.hyper)
+    assert np.abs(healed.predict(features) - clean.predict(features)).max() < 5 * sigma
+
+
+@every_kernel
+def test_two_points_are_refused_with_the_number_needed_or_joined(name, p):
+    features, gaze = recording(2)
+    with pytest.raises(CalibrationError, match="give at least 3"):
+        GaussianProcess.fit(features, gaze, mean="constant", kernel=name, p=p)
+    gp = quietly(features, gaze, mean="zero", hyper=hyper_for(name, 1.0, 30.0, 0.1), kernel=name, p=p)
+    np.testing.assert_allclose(gp.predict(features), gaze, atol=0.1)
+    assert np.abs(gp.predict(recording(50, seed=1)[0])).max() < 60
+
+
+@every_kernel
+def test_five_points_give_a_calm_answer(name, p):
+    features, gaze = recording(5)
+    gp = quietly(features, gaze, mean="constant", kernel=name, p=p)
+    mean, std = gp.predict(recording(50, seed=2)[0], return_std=True)
+    assert np.abs(mean).max() < 60 and np.isfinite(std).all() and std.min() >= 0
+    with pytest.raises(CalibrationError, match="give at least 9"):
+        GaussianProcess.fit(features, gaze, mean="linear", kernel=name, p=p)
+
+
+def test_ten_thousand_points_keep_3000_and_predict_the_others():
+    features, gaze = recording(10_000, noise_deg=0.5)
+    with pytest.warns(UserWarning, match="10000 samples given, 3000 of them kept"):
+        gp = GaussianProcess.fit(features, gaze, mean="constant", hyper=Hyper(LENGTH, 30.0, 0.5))
+    assert len(gp.x) == 3000 and gp.rows_given == 10_000
+    mean, std = gp.predict(features, return_std=True)
+    assert np.sqrt(np.mean((mean - gaze) ** 2)) < 0.6 and mean.shape == (10_000, 2) and std.max() < 3
+    order = np.random.default_rng(0).permutation(10_000)
+    again = quietly(features[order], gaze[order], mean="constant", hyper=gp.hyper)
+    np.testing.assert_array_equal(again.predict(features[:100]), gp.predict(features[:100]))
+
+
+@every_kernel
+def test_all_targets_on_a_line(name, p):
+    features, gaze = recording(50)
+    gaze[:, 1] = 0.5 * gaze[:, 0] + 1.0
+    gp = quietly(features, gaze, mean="constant", kernel=name, p=p, restarts=0)
+    got = gp.predict(recording(50, seed=4)[0])
+    np.testing.assert_allclose(got[:, 1], 0.5 * got[:, 0] + 1.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("p", [0.5, 1.0, 1.5, 2.0])
+def test_p_up_to_2_is_positive_definite_and_needs_no_repair(p):
+    features, gaze = recording(60)
+    gp = quietly(features, gaze, mean="constant", kernel="minkowski", p=p, restarts=0)
+    told = gp.describe()
+    assert gp.repair is None and told["positive_definite"] and told["p"] == p and gp.jitter == 0
+    error = np.linalg.norm(gp.y - gp.loo()[0], axis=1)
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(told["loo_rms_deg"]) and told["loo_rms_deg"] < 5
+
+
+def test_p_1_is_laplace_and_p_2_is_rbf_of_another_length():
+    features, gaze = recording(30)
+    query, hyper = recording(10, seed=1)[0], Hyper(LENGTH, 20.0, 0.3)
+    for p, name, factor in ((1.0, "laplace", 1.0), (2.0, "rbf", np.sqrt(0.5))):
+        a = GaussianProcess.fit(features, gaze, hyper=hyper, kernel="minkowski", p=p)
+        b = GaussianProcess.fit(features, gaze, hyper=Hyper(LENGTH * factor, 20.0, 0.3), kernel=name)
+        np.testing.assert_allclose(a.predict(query), b.predict(query), atol=1e-8)
+
+
+@pytest.mark.parametrize("p", [3.0, 10.0, np.inf])
+def test_p_above_2_is_repaired_in_words_and_predicts_consistently(p):
+    features, gaze = recording(70)
+    with pytest.warns(UserWarning, match="gives no covariance in 3 or more channels"):
+        gp = GaussianProcess.fit(features, gaze, mean="constant", kernel="minkowski", p=p, restarts=0)
+    assert gp.repair["smallest_eigenvalue"] < 0 < gp.repair["removed_share"] < 0.5
+    assert not gp.describe()["positive_definite"] and "removed" in gp.describe()["repair"]["words"]
+    # The matrix that is solved is a covariance: its factor exists, and no eigenvalue is below the noise.
+    solved = gp._factor[0] @ gp._factor[0].T
+    noise2 = gp.hyper.noise_deg**2
+    assert np.linalg.eigvalsh(solved)[0] > 0.5 * noise2
+    # Predictions at the data are those of that matrix: S y with S = K+ (K+ + noise)^-1 and a constant.
+    one = np.ones((70, 1))
+    inside = solved - noise2 * np.eye(70)
+    b = np.linalg.solve(one.T @ np.linalg.solve(solved, one), one.T @ np.linalg.solve(solved, gp.y))
+    expected = inside @ np.linalg.solve(solved, gp.y - one @ b) + one @ b
+    np.testing.assert_allclose(gp.predict(gp.x), expected, atol=1e-6)
+    mean, std = gp.predict(recording(200, seed=6)[0], return_std=True)
+    assert np.isfinite(mean).all() and std.min() > 0
+    assert np.sqrt(np.mean((gp.predict(recording(200, 6)[0]) - recording(200, 6)[1]) ** 2)) < 3
+
+
+def test_leave_one_out_of_a_repaired_process_is_that_of_its_matrix():
+    features, gaze = recording(40)
+    gp = quietly(features, gaze, mean="zero", kernel="minkowski", p=10.0, hyper=Hyper(LENGTH * 5, 30.0, 0.3))
+    solved = gp._factor[0] @ gp._factor[0].T
+    predicted, _ = gp.loo()
+    for i in (0, 13, 39):
+        rest = np.arange(40) != i
+        expected = solved[i, rest] @ np.linalg.solve(solved[np.ix_(rest, rest)], gp.y[rest])
+        np.testing.assert_allclose(predicted[i], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("p", [3.0, 10.0])
+def test_p_above_2_in_two_channels_is_a_covariance_and_left_alone(p):
+    features, gaze = recording(40)
+    gp = quietly(features[:, :2], gaze, mean="constant", kernel="minkowski", p=p, restarts=0)
+    assert gp.repair is None and gp.describe()["positive_definite"]
+
+
+def test_weights_that_alternate_hugely_still_give_the_right_digits():
+    """Neighbours 1 step apart with labels of +-5 deg and hardly any noise: weights 1e6 times the answer."""
+    rng = np.random.default_rng(1)
+    features = recording(11)[0]
+    features = np.repeat(features, 2, axis=0) + np.tile([[0.0], [3.0]], (11, 6))
+    gaze = rng.uniform(-5, 5, (22, 2)) + np.tile([[5.0], [-5.0]], (11, 2))
+    gp = quietly(features, gaze, mean="zero", hyper=Hyper(LENGTH, 30.0, 1e-3))
+    weights = gp.alpha * gp.hyper.signal_deg**2
+    assert np.abs(weights).max() > 1e4 * np.abs(gaze).max()
+    assert np.sum(np.diff(np.sign(weights[np.argsort(gp.x[:, 0])]), axis=0) != 0) > 22
+    error = np.abs(gp.predict(features) - reference(gp, features)).max()
+    assert error <= gp.rounding_deg <= 0.01
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])
+@every_kernel
+def test_nan_infinities_and_absurd_sizes_are_refused_in_words(name, p, bad):
+    features, gaze = recording(20)
+    fine = quietly(features, gaze, mean="constant", kernel=name, p=p, hyper=hyper_for(name, 1.0, 30.0, 0.3))
+    features[3, 1] = bad
+    with pytest.raises(CalibrationError, match="nan or infinity|1e100"):
+        GaussianProcess.fit(features, gaze, kernel=name, p=p)
+    with pytest.raises(CalibrationError, match="nan or infinity|1e100"):
+        GaussianProcess.fit(gaze + 30, features[:, :2], kernel=name, p=p)
+    if not np.isfinite(bad):
+        for ask in (fine.predict, fine.gradient):
+            with pytest.raises(CalibrationError, match="nan or infinity"):
+                ask(features)
+
+
+def test_queries_of_another_width_or_outside_the_measure_are_refused():
+    features, gaze = recording(30)
+    gp = quietly(features, gaze, mean="constant", kernel="canberra", hyper=hyper_for("canberra", 1.0, 30.0, 0.3))
+    with pytest.raises(CalibrationError, match="6 channels"):
+        gp.predict(features[:, :5])
+    with pytest.raises(CalibrationError, match="below 0"):
+        gp.predict(-features)
+    assert gp.predict(features[:0]).shape == (0, 2)
+
+
+@every_kernel
+@pytest.mark.parametrize("mean", ["zero", "constant", "linear"])
+def test_the_gradient_of_the_mean_equals_high_order_differences(name, p, mean):
+    features, gaze = recording(40)
+    gp = quietly(features, gaze, mean=mean, kernel=name, p=p, hyper=hyper_for(name, 3.0, 30.0, 0.3))
+    query = recording(8, seed=7)[0]
+    slope = gp.gradient(query)
+    for j in range(6):
+        step = np.zeros(6)
+        step[j] = 0.5
+        at = {k: gp.predict(query + k * step) for k in (-3, -2, -1, 1, 2, 3)}
+        expected = ((at[3] - at[-3]) / 60 - 3 * (at[2] - at[-2]) / 20 + 3 * (at[1] - at[-1]) / 4) / 0.5
+        # At a sample of the same value in channel j kernels with a cusp have none; these queries avoid it by > 2.
+        apart = np.abs(query[:, None, j] - gp.x[:, j]).min(axis=1) > 2.0
+        smooth = name in ("rbf", "matern52", "cosine")
+        rows = np.ones(8, bool) if smooth else apart
+        np.testing.assert_allclose(slope[rows, :, j], expected[rows], rtol=2e-4, atol=2e-6)
+
+
+def test_order_and_threads_do_not_change_a_bit_whatever_the_kernel(tmp_path):
+    """Another process with four threads of BLAS, the samples shuffled: the same bytes."""
+    features, gaze = recording(300)
+    np.savez(tmp_path / "data.npz", x=features, y=gaze)
+    script = (
+        "import sys, warnings, numpy as np; warnings.simplefilter('ignore')\n"
+        "from sparsegaze.gp import GaussianProcess\n"
+        f"data = np.load(r'{tmp_path / 'data.npz'}')\n"
+        "order = np.random.default_rng(int(sys.argv[1])).permutation(300)\n"
+        "for name, p in (('rbf', None), ('laplace', None), ('minkowski', 3.0)):\n"
+        "    args = dict(mean='constant', kernel=name, p=p, restarts=0, learn_rows=150)\n"
+        "    gp = GaussianProcess.fit(data['x'][order], data['y'][order], **args)\n"
+        "    mean, std = gp.predict(data['x'], return_std=True)\n"
+        "    print(mean.tobytes().hex()[:4000], std.tobytes().hex()[:2000], gp.lml)\n"
+    )
+    answers = []
+    for seed, threads in (("1", "1"), ("2", "4")):
+        env = dict(__import__("os").environ, OMP_NUM_THREADS=threads, OPENBLAS_NUM_THREADS=threads)
+        done = subprocess.run([sys.executable, "-c", script, seed], env=env, capture_output=True, text=True, check=True)
+        answers.append(done.stdout)
+    assert answers[0] == answers[1] and len(answers[0]) > 10_000
+
+
+@every_kernel
+def test_describe_is_json_and_names_what_a_reader_needs(name, p):
+    gp = quietly(*recording(30), mean="constant", kernel=name, p=p, restarts=0)
+    told = json.loads(json.dumps(gp.describe(), allow_nan=False))
+    assert told["kernel"] == name and told["lml"] == gp.lml and told["rows"] == told["rows_given"] == 30
+    for key in ("formula", "length_unit", "condition", "jitter", "loo_rms_deg", "rounding_deg", "repair", "p"):
+        assert key in told
+
+
+def test_learning_on_a_part_and_polishing_on_all_reaches_the_likelihood_of_learning_on_all():
+    features, gaze = recording(400)
+    whole = quietly(features, gaze, mean="constant")
+    part = quietly(features, gaze, mean="constant", learn_rows=130)
+    assert part.lml > whole.lml - 0.5
+    assert 0 <= part.likelihood_gap(restarts=1) < 1.0
+    poor = quietly(features, gaze, mean="constant", hyper=Hyper(LENGTH, 30.0, 1.0))
+    assert poor.likelihood_gap(restarts=1) > 10
