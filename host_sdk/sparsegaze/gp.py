@@ -405,14 +405,18 @@ class GaussianProcess:
         removed = float(np.abs(values[values < 0]).sum() / np.abs(values).sum())
         least = float(values[0] / self.hyper.signal_deg**2)
         self._spectrum = values[kept], vectors[:, kept]
+        negative = int((values < -EPS * len(values) * values[-1]).sum())
+        done = f"{negative} negative eigenvalues, {100 * removed:.2g} % of the spectrum, were removed"
         self.repair = {
             "words": f"the Minkowski distance of p = {self.kernel.p:g} gives no covariance in 3 or more channels: "
-            f"{int((values < 0).sum())} negative eigenvalues, {100 * removed:.2g} % of the spectrum, were removed",
+            + (done if negative else "on these samples it happens to, nothing had to be removed"),
+            "negative": negative,
             "smallest_eigenvalue": least,
             "removed_share": removed,
             "rank": int(kept.sum()),
         }
-        warnings.warn(self.repair["words"], stacklevel=6)
+        if negative:
+            warnings.warn(self.repair["words"], stacklevel=6)
         return cov
 
     def _jitter_deg(self):

@@ -73,6 +73,7 @@ class Kernel:
     exponent = None
     degree = 1.0
     per_channel = True
+    additive = True  # u is a weighted sum of terms that do not depend on the lengths
     length_unit = "feature units"
     start = 3.0  # length in natural units from which a search begins
 
@@ -247,7 +248,7 @@ class Steep(Kernel):
     Scaled by the largest difference, so that no power overflows at any p; p = inf is that difference alone.
     """
 
-    name, start = "minkowski", 10.0
+    name, start, additive = "minkowski", 10.0, False
 
     def __init__(self, p, q):
         self.p, self.exponent = p, q

@@ -39,7 +39,7 @@ class Likelihood:
         self.unit, self.noise_free, self.group_noise = np.asarray(unit, float), noise_free, group_noise
         self.sound = kernel.definite(z.shape[1])
         self._stack = None
-        if len(z) <= STACK_MOST and self.sound:
+        if len(z) <= STACK_MOST and kernel.additive:
             a = kernel.coordinates(z)
             self._stack = np.stack(list(kernel.terms(a, a)))
 

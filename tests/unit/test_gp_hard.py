@@ -167,26 +167,29 @@ def test_exact_duplicates_without_noise_take_a_jitter_that_is_reported(name, p):
 
 
 def test_the_condition_number_is_right_up_to_where_float64_can_tell_and_named_beyond():
-    """Two samples at a distance have K = s^2 [[1, c], [c, 1]], condition (1 + c) / (1 - c), known in closed form."""
+    """Two samples at a distance have K = s^2 [[1, c], [c, 1]], condition (1 + c) / (1 - c), known in closed form.
+
+    Figures are right to 1e-14 of themselves squared: 4 % at 4e12. A third sample is far away.
+    """
     for gap, expected_known in ((1.0, True), (1e-3, True), (1e-6, True), (3e-7, True), (1e-8, False), (0.0, False)):
-        x = np.array([[0.0], [gap], [40.0]])
+        x = np.array([[0.0], [gap], [9.0]])
         gp = quietly(x, np.zeros((3, 2)) + [[1.0], [1.0], [-1.0]], mean="zero", hyper=Hyper(np.ones(1), 1.0, 0.0))
         c = np.exp(-0.5 * gap**2)
         told = gp.describe()
         if expected_known:
             expected = (1 + c) / -np.expm1(-0.5 * gap**2)
-            assert gp.condition_raw == pytest.approx(expected, rel=max(1e-9, 1e-16 * expected * 4))
+            assert gp.condition_raw == pytest.approx(expected, rel=max(1e-9, 1e-14 * expected))
             assert told["condition_raw"] == gp.condition_raw and told["condition_note"] == ""
         else:
             assert told["condition_raw"] is None and "4.5e+14" in told["condition_note"]
-            assert gp.jitter > 0 and gp.condition < 1e13
+            assert gp.rounding_deg < 0.01 and (gp.jitter > 0 or gap > 0)
 
 
 @pytest.mark.parametrize("noise_deg", [1e-2, 1e-4, 1e-6, 1e-8])
 def test_condition_numbers_to_1e16_and_beyond_predict_within_the_bound(noise_deg):
     features, gaze = recording(22)
-    gp = quietly(features, gaze, mean="zero", hyper=Hyper(LENGTH * 100, 3e2, noise_deg))
-    assert gp.condition_raw > 0.5 * 22 * (3e2 / noise_deg) ** 2 or gp.condition_raw > 1e15
+    gp = quietly(features, gaze, mean="zero", hyper=Hyper(LENGTH * 1e4, 3e2, noise_deg))
+    assert gp.condition_raw > 0.9 * min(22 * (3e2 / noise_deg) ** 2, 1e15)
     query = recording(5, seed=8)[0]
     assert np.abs(gp.predict(query) - reference(gp, query)).max() <= gp.rounding_deg <= 0.01
 
@@ -205,7 +208,7 @@ def test_the_papers_form_without_noise_learns_interpolates_and_reports(name, p):
 
 def test_noise_that_differs_between_samples_is_weighed():
     features, gaze = recording(40)
-    scale = np.where(np.arange(40) % 2, 1e6, 1.0)
+    scale = np.where(np.arange(40) % 2, 1e12, 1.0)
     gp = quietly(features, gaze, noise_scale=scale, mean="constant", hyper=Hyper(LENGTH, 30.0, 0.3))
     few = quietly(features[::2], gaze[::2], mean="constant", hyper=gp.hyper)
     np.testing.assert_allclose(gp.predict(features), few.predict(features), atol=0.1)
@@ -307,7 +310,7 @@ def test_ten_thousand_points_keep_3000_and_predict_the_others():
     with pytest.warns(UserWarning, match="10000 samples given, 3000 of them kept"):
         gp = GaussianProcess.fit(features, gaze, mean="constant", hyper=Hyper(LENGTH, 30.0, 0.5))
     assert len(gp.x) == 3000 and gp.rows_given == 10_000
-    mean, std = gp.predict(features, return_std=True)
+    mean, std = gp.predict(features), gp.predict(features[:500], return_std=True)[1]
     assert np.sqrt(np.mean((mean - gaze) ** 2)) < 0.6 and mean.shape == (10_000, 2) and std.max() < 3
     order = np.random.default_rng(0).permutation(10_000)
     again = quietly(features[order], gaze[order], mean="constant", hyper=gp.hyper)
@@ -342,35 +345,57 @@ def test_p_1_is_laplace_and_p_2_is_rbf_of_another_length():
         np.testing.assert_allclose(a.predict(query), b.predict(query), atol=1e-8)
 
 
+def indefinite(p, n=200):
+    """Samples that fill six dimensions, on which p > 2 shows: (features [n, 6], gaze [n, 2], Hyper)."""
+    rng = np.random.default_rng(1)
+    z = rng.standard_normal((n, 6))
+    gaze = 8 * np.stack([np.sin(z[:, 0]) + z[:, 1], z[:, 2]], 1) + 0.3 * rng.standard_normal((n, 2))
+    return 40000 + 1000 * z, gaze, Hyper(np.full(6, 3e4), 60.0, 0.3)
+
+
 @pytest.mark.parametrize("p", [3.0, 10.0, np.inf])
 def test_p_above_2_is_repaired_in_words_and_predicts_consistently(p):
-    features, gaze = recording(70)
-    with pytest.warns(UserWarning, match="gives no covariance in 3 or more channels"):
-        gp = GaussianProcess.fit(features, gaze, mean="constant", kernel="minkowski", p=p, restarts=0)
-    assert gp.repair["smallest_eigenvalue"] < 0 < gp.repair["removed_share"] < 0.5
+    features, gaze, hyper = indefinite(p)
+    with pytest.warns(UserWarning, match="gives no covariance in 3 or more channels.*eigenvalues.*were removed"):
+        gp = GaussianProcess.fit(features, gaze, mean="constant", kernel="minkowski", p=p, hyper=hyper)
+    assert gp.repair["smallest_eigenvalue"] < -1e-3 and 0 < gp.repair["removed_share"] < 0.5
+    assert gp.repair["negative"] > 0 and gp.repair["rank"] + gp.repair["negative"] <= 200
     assert not gp.describe()["positive_definite"] and "removed" in gp.describe()["repair"]["words"]
-    # The matrix that is solved is a covariance: its factor exists, and no eigenvalue is below the noise.
+    # The matrix that is solved is a covariance: no eigenvalue is below the noise.
     solved = gp._factor[0] @ gp._factor[0].T
     noise2 = gp.hyper.noise_deg**2
-    assert np.linalg.eigvalsh(solved)[0] > 0.5 * noise2
-    # Predictions at the data are those of that matrix: S y with S = K+ (K+ + noise)^-1 and a constant.
-    one = np.ones((70, 1))
-    inside = solved - noise2 * np.eye(70)
+    assert np.linalg.eigvalsh(solved)[0] > 0.99 * noise2
+    # It is the kernel's own matrix less its negative part ...
+    own = gp._kernel(gp.x) + noise2 * np.eye(200)
+    least = np.linalg.eigvalsh(own - noise2 * np.eye(200))[0]
+    assert np.linalg.norm(solved - own, 2) == pytest.approx(-least, rel=1e-6)
+    # ... and predictions at the data are that matrix's: S y with S = K+ (K+ + noise)^-1 and a constant.
+    one = np.ones((200, 1))
+    inside = solved - noise2 * np.eye(200)
     b = np.linalg.solve(one.T @ np.linalg.solve(solved, one), one.T @ np.linalg.solve(solved, gp.y))
     expected = inside @ np.linalg.solve(solved, gp.y - one @ b) + one @ b
     np.testing.assert_allclose(gp.predict(gp.x), expected, atol=1e-6)
-    mean, std = gp.predict(recording(200, seed=6)[0], return_std=True)
+    mean, std = gp.predict(gp.x + 300.0, return_std=True)
     assert np.isfinite(mean).all() and std.min() > 0
-    assert np.sqrt(np.mean((gp.predict(recording(200, 6)[0]) - recording(200, 6)[1]) ** 2)) < 3
+
+
+@pytest.mark.parametrize("p", [3.0, 10.0])
+def test_p_above_2_learns_and_says_when_nothing_had_to_be_removed(p):
+    features, gaze = recording(70)
+    gp = quietly(features, gaze, mean="constant", kernel="minkowski", p=p, restarts=0)
+    assert gp.repair["negative"] == 0 and "nothing had to be removed" in gp.repair["words"]
+    error = gp.predict(recording(100, 6)[0]) - recording(100, 6)[1]
+    assert np.sqrt(np.mean(error**2)) < 3
 
 
 def test_leave_one_out_of_a_repaired_process_is_that_of_its_matrix():
-    features, gaze = recording(40)
-    gp = quietly(features, gaze, mean="zero", kernel="minkowski", p=10.0, hyper=Hyper(LENGTH * 5, 30.0, 0.3))
+    features, gaze, hyper = indefinite(10.0)
+    gp = quietly(features, gaze, mean="zero", kernel="minkowski", p=10.0, hyper=hyper)
     solved = gp._factor[0] @ gp._factor[0].T
+    assert gp.repair["negative"] > 0
     predicted, _ = gp.loo()
     for i in (0, 13, 39):
-        rest = np.arange(40) != i
+        rest = np.arange(200) != i
         expected = solved[i, rest] @ np.linalg.solve(solved[np.ix_(rest, rest)], gp.y[rest])
         np.testing.assert_allclose(predicted[i], expected, atol=1e-6)
 

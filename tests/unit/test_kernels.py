@@ -76,15 +76,20 @@ def test_the_kernel_is_its_formula(case):
 @all_cases
 def test_the_slope_in_the_features_equals_high_order_differences(case):
     made = kernel(*CASES[case])
-    x, query = points(), points(9, seed=1)
+    x, query = points(), points(40, seed=1)
+    query = query[(np.abs(query[:, None] - x) > 0.02).all((1, 2))][:9]  # kernels with a cusp have no slope there
     length, alpha = lengths(made, 4), np.random.default_rng(3).standard_normal((20, 2))
+    if case == "p=inf":  # nor has this where two channels tie
+        ordered = np.sort(np.abs(query[:, None] - x) / length, axis=-1)
+        query = query[(ordered[..., -1] - ordered[..., -2] > 1e-3).all(axis=1)]
+    assert len(query) > 3
     slope = made.slope(query, x, length, alpha)
     for j in range(4):
         step = np.zeros(4)
-        step[j] = 1e-3
+        step[j] = 3e-5
         at = {k: made.value(query + k * step, x, length) @ alpha for k in (-3, -2, -1, 1, 2, 3)}
         expected = (at[3] - at[-3]) / 60 - 3 * (at[2] - at[-2]) / 20 + 3 * (at[1] - at[-1]) / 4
-        np.testing.assert_allclose(slope[:, :, j], expected / 1e-3, rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(slope[:, :, j], expected / 3e-5, rtol=1e-6, atol=1e-7)
 
 
 def reference_likelihood(case, theta, x, unit, y, h, noise_scale, groups, noise_free):
@@ -94,7 +99,7 @@ def reference_likelihood(case, theta, x, unit, y, h, noise_scale, groups, noise_
     count = len(unit)
     k = value[count] ** 2 * written_out(case, x, x, value[:count] * unit)
     rest = list(value[count + 1 :] ** 2)
-    k = k + np.diag((1e-10 * value[count] ** 2 if noise_free else rest.pop(0)) * (1 if noise_free else noise_scale))
+    k = k + np.diag(np.full(len(x), 1e-10 * value[count] ** 2) if noise_free else rest.pop(0) * noise_scale)
     if rest:
         k = k + rest[0] * (groups[:, None] == groups)
     assert made.definite(x.shape[1])
@@ -140,19 +145,20 @@ def test_the_likelihood_and_its_gradient_equal_a_complex_step(case, mean, noise_
 def test_the_gradient_of_the_repaired_likelihood_equals_high_order_differences(p):
     made = kernel("minkowski", p)
     rng = np.random.default_rng(1)
-    x = rng.standard_normal((40, 6))
+    n = 150
+    x = rng.standard_normal((n, 6))
     z, unit, _ = made.natural(x)
-    whole = Likelihood(made, z, unit, rng.standard_normal((40, 2)), np.ones((40, 1)), np.ones(40), np.arange(40))
+    whole = Likelihood(made, z, unit, rng.standard_normal((n, 2)), np.ones((n, 1)), np.ones(n), np.arange(n))
     theta = np.log(np.r_[rng.uniform(20, 40, 6), 2.0, 0.3])
     values = np.linalg.eigvalsh(made.value(z, z, np.exp(theta[:6])))
     assert values[0] < -1e-4  # else nothing is repaired here
     _, slope = whole(theta)
     for i in range(len(theta)):
         step = np.zeros(len(theta))
-        step[i] = 3e-5
+        step[i] = h = 1e-6 if np.isinf(p) else 3e-5  # p = inf has a kink wherever two channels tie
         at = {k: whole(theta + k * step)[0] for k in (-2, -1, 1, 2)}
-        expected = (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / 12 / 3e-5
-        assert slope[i] == pytest.approx(expected, rel=1e-4, abs=1e-4)
+        expected = (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / 12 / h
+        assert slope[i] == pytest.approx(expected, rel=1e-4, abs=1e-3)
 
 
 @pytest.mark.parametrize("case", DEFINITE)
@@ -248,12 +254,11 @@ def test_refining_from_a_part_reaches_the_maximum_of_the_whole(case):
     y = gaze + 0.05 * rng.standard_normal((240, 2))
     whole = Likelihood(made, z, unit, y, np.ones((240, 1)), np.ones(240), np.arange(240))
     part = whole.part(np.arange(0, 240, 3))
-    start, _ = maximise(part, [part.start()], np.exp(10.0))
+    start, _ = maximise(part, [part.start()], 100.0)
     before = whole(start)[0]
     theta, value, used = refine(whole, part, start, 100.0, 14)
-    _, best = maximise(whole, [theta, whole.start()], 100.0, tight=True)
-    assert used <= 14 and before <= value <= best + 1e-6
-    assert best - value < max(0.1, 0.1 * (best - before))
+    _, best = maximise(whole, [start], 100.0, tight=True)
+    assert used <= 14 and before + 0.1 < value <= best + 1e-4 and value > best - 0.01
 
 
 def test_every_name_is_tested():
