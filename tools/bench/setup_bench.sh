@@ -1,8 +1,11 @@
 #!/bin/sh
 # SPDX-License-Identifier: Apache-2.0
-# Installs what only the benchmark's peers need: .venv-bench with the packages of requirements-bench.txt
-# (Mitsuba 3 and numpy, by hash), and Debian's libllvm19, with which alone Mitsuba 3.9 runs. `make setup` and
-# `make test` never come here. A second run does nothing.
+# Installs what only the benchmarks' peers need: .venv-bench with the packages of requirements-bench.txt, by
+# hash (Mitsuba 3 for bench-sim; scikit-learn, m2cgen, emlearn and micromlgen for bench-inference), and
+# Debian's libllvm19, with which alone Mitsuba 3.9 runs. `make setup` and `make test` never come here. A second
+# run does nothing.
+#
+#   usage: sh tools/bench/setup_bench.sh [--without-llvm]     what bench-inference needs; no apt
 #
 #   PYTHON    the interpreter that .venv-bench is made with (python3)
 #
@@ -21,7 +24,7 @@ has_llvm() {
 }
 
 mkdir -p build/setup
-if ! has_llvm; then
+if [ "${1:-}" != --without-llvm ] && ! has_llvm; then
     sudo=sudo
     if [ "$(id -u)" = 0 ]; then
         sudo=
@@ -42,8 +45,14 @@ fi
 say "installing the packages of requirements-bench.txt into $venv"
 "$python" -m venv --clear $venv
 printf "*\n" >$venv/.gitignore
-$venv/bin/python -m pip install -qq --disable-pip-version-check --no-input --only-binary :all: \
-    --require-hashes -r requirements-bench.txt || die "pip could not install requirements-bench.txt: see
-    above"
+# micromlgen has no wheel. It is built with the pinned setuptools, which therefore comes first: pip's own build
+# environment would fetch one without a hash.
+awk '/^[a-z]/ { own = /^setuptools==/ } own' requirements-bench.txt >build/setup/bench-first.txt
+install() {
+    $venv/bin/python -m pip install -qq --disable-pip-version-check --no-input --only-binary :all: \
+        --require-hashes "$@" || die "pip could not install requirements-bench.txt: see above"
+}
+install -r build/setup/bench-first.txt
+install --no-build-isolation --no-binary micromlgen -r requirements-bench.txt
 echo "$stamp" >$venv/setup-stamp
 say "done"
