@@ -2,7 +2,7 @@
 # The one entry point; CI runs `make test`. `make` alone lists what there is.
 #
 #   SEED=k       the simulated person, parts and noise of `make demo`; SEEDS="..." those of `make seeds`
-#   ARGS="..."   handed on: to tools/demo.py by `make demo`, to pytest by `make test`, to tools/bench by `make bench-sim`
+#   ARGS="..."   handed on: to tools/demo.py by `make demo`, to pytest by `make test`, to tools/bench by `make bench-...`
 #   PYTHON=...   the interpreter that .venv is made with
 
 SHELL := /bin/sh
@@ -29,11 +29,11 @@ quietly = echo "$(1)"; { $(1); } >build/native/log 2>&1 || { cat build/native/lo
 # $(1) over $(2) when it differs, at one stroke because somebody may be reading; then the command $(3).
 refresh = cmp -s $(1) $(2) || { cp $(1) $(2).new && mv $(2).new $(2) && $(if $(3),$(3),:); }
 
-.PHONY: help setup firmware native demo seeds test bench-sim check size lock clean distclean
+.PHONY: help setup firmware native demo seeds test bench-sim bench-inference check size lock clean distclean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/  make \1#\2/p' $(MAKEFILE_LIST) | \
-	    awk -F'#' '{ printf "%-18s%s\n", $$1, $$2 }'
+	    awk -F'#' '{ printf "%-24s%s\n", $$1, $$2 }'
 
 setup: ## install what is missing: Debian packages (when root or sudo), .venv with pinned packages
 	@sh tools/setup.sh
@@ -80,6 +80,10 @@ test: setup firmware native ## every test; ARGS="-k name" for some
 bench-sim: setup native ## the simulator's speed against its error, with peers; ARGS="--quick --no-peers"
 	@sh tools/bench/setup_bench.sh
 	@$(PY) tools/bench/bench_sim.py $(ARGS)
+
+bench-inference: setup firmware native ## inference on the device, cycles against error, with peers; ARGS="--quick --no-peers"
+	@sh tools/bench/setup_bench.sh --without-llvm
+	@$(PY) tools/bench/bench_inference.py $(ARGS)
 
 check: firmware ## the quick static checks: includes, licences, packaging, link
 	@$(PY) tests/check_includes.py
