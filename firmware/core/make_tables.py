@@ -60,13 +60,13 @@ def rounded(x):
 
 
 def exp_table():
-    """[(drop to the next level Q10.6, level Q0.16)] for 2^-(i/64), i = 0..1023.
+    """2^16 exp(-i / 128), i = 0..1663, Q0.16; zeros behind the last that is not.
 
-    The chord lies above the curve and the device floors the interpolated drop: both means are taken off the
-    nodes, which halves the worst error."""
-    step = math.log(2.0) / 64
-    level = [math.floor(65536 * 2.0 ** (-i / 64) * (1 - step * step / 16)) for i in range(1025)]
-    return [(64 * (level[i] - level[i + 1]), level[i]) for i in range(1024)]
+    The device goes on from a node along its tangent, with the upper byte of the level only: what that misses in
+    the mean, and half a step for its floor, is put into the nodes."""
+    level = [math.floor(65536 * math.exp(-i / 128)) for i in range(1664)]
+    level[0] = 65535
+    return level
 
 
 def rows(values, per_row=12):
@@ -79,9 +79,8 @@ def rows(values, per_row=12):
 
 def gp_table():
     """Text of sg_gp_table.c."""
-    values = [v for pair in exp_table() for v in pair]
     return (LICENSE + MADE_BY + '#include "sg_gp_loop.h"\n#include "sg_rom.h"\n\n'
-            "const uint16_t sg_gp_exp_table[2048] SG_ROM = {\n" + rows(values) + "};\n")
+            "const uint16_t sg_gp_exp_table[SG_GP_EXP_ENTRIES] SG_ROM = {\n" + rows(exp_table()) + "};\n")
 
 
 def tanh_table():

@@ -1,11 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 ; sg_gp_loop.c for AVR with a multiplier, bit-identical to it. Formats in sg_gp_loop.h.
 ;
-; Every value of sg_gp_loop lives in a register but S2, half of s4, and s5: these it reads from *sum once per
-; record.
+; Nothing here takes a time that depends on data.
 
 #if defined(__AVR__) && !defined(SG_GP_PORTABLE)
 
+#define SUM_S2 8
+#define SUM_S 12
+
+; ---- void sg_gp_loop(struct sg_gp_sum *sum r25:r24, const uint8_t *record r23:r22, uint8_t n r20,
+;                      uint8_t space r18)
+; All of it lives in registers; Z walks the records, X keeps Z while the table is read.
 #define s0l r2
 #define s0h r3
 #define s1l r4
@@ -15,139 +20,95 @@
 #define s3l r8
 #define s3h r9
 #define s4l r10
-#define zero r11
-#define az0 r12
-#define az1 r13
-#define az2 r14
-#define az3 r15
-#define t0 r16                  /* T, 20.4, 24 bits; then fraction Q0.10; then k Q0.16 */
-#define t1 r17
-#define t2 r18
-#define byte r19                /* c, a byte of drop, high byte of a weight */
-#define carry2 r20              /* bits 16..23 of drop * fraction */
-#define left r21
-#define savedl r22
-#define el0 r24
-#define el1 r25
-#define el2 r26
-#define el3 r27
+#define s4h r11
+#define s5l r12
+#define s5h r13
+#define square0 r14             /* S2, 20.4 */
+#define square1 r15
+#define t1 r16                  /* T, 20.4, bytes 1 and 2; then k Q0.16 */
+#define t2 r17
+#define t0 r18                  /* T, byte 0; then fraction Q0.8; then a byte of a weight */
+#define az0 r19
+#define az1 r20
+#define az2 r21
+#define el0 r22
+#define el1 r23
+#define el2 r24
+#define square2 r25
+#define c r26                   /* XL: a centre's coordinate, while X is not in use */
+#define zero r28
+#define left r29
 
-#define SUM_S2 8
-#define SUM_S4H 21
-#define SUM_S5L 22
-#define SUM_S5H 23
-
-; T -= c * s for the next centre of the record: u8 * u8.4, both halves of s in registers
+; T -= c * s for the next centre of the record: u8 * u8.4
 .macro channel load, low, high
-    \load byte, Z+
-    mul \low, byte
+    \load c, Z+
+    mul \low, c
     sub t0, r0
     sbc t1, r1
     sbc t2, zero
-    mul \high, byte
+    mul \high, c
     sub t1, r0
     sbc t2, r1
 .endm
 
-; acc += weight * k: s16 * u16 into 32 bits modulo 2^32
-.macro weigh load, a0, a1, a2, a3
-    \load t2, Z+
-    \load byte, Z+
-    mul t2, t0
+; acc += weight * k: s16 * u16 without the product of the low bytes, into 24 bits modulo 2^24
+.macro weigh load, a0, a1, a2
+    \load t0, Z+
+    mul t0, t2
     add \a0, r0
     adc \a1, r1
     adc \a2, zero
-    adc \a3, zero
-    mul t2, t1
+    \load t0, Z+
+    mulsu t0, t1
+    sbc \a2, zero               ; carry is the product's sign
+    add \a0, r0
+    adc \a1, r1
+    adc \a2, zero
+    mulsu t0, t2
     add \a1, r0
     adc \a2, r1
-    adc \a3, zero
-    mulsu byte, t0
-    sbc \a3, zero               ; carry is the product's sign
-    add \a1, r0
-    adc \a2, r1
-    adc \a3, zero
-    mulsu byte, t1
-    add \a2, r0
-    adc \a3, r1
 .endm
 
 .macro loop load
 1:
-    \load t0, Z+
+    mov t0, square0
     \load t1, Z+
+    add t1, square1
     \load t2, Z+
-    ldd r0, Y+SUM_S2
-    add t0, r0
-    ldd r0, Y+SUM_S2+1
-    adc t1, r0
-    ldd r0, Y+SUM_S2+2
-    adc t2, r0
+    adc t2, square2
     channel \load, s0l, s0h
     channel \load, s1l, s1h
     channel \load, s2l, s2h
     channel \load, s3l, s3h
-    ldd carry2, Y+SUM_S4H
-    channel \load, s4l, carry2
-    \load byte, Z+
-    ldd r0, Y+SUM_S5L
-    mul r0, byte
-    sub t0, r0
-    sbc t1, r1
-    sbc t2, zero
-    ldd r0, Y+SUM_S5H
-    mul r0, byte
-    sub t1, r0
-    sbc t2, r1
+    channel \load, s4l, s4h
+    channel \load, s5l, s5h
 
-    cpi t2, 0x10                ; T < 2^20 and not negative, in one comparison
-    brlo 3f
-    tst t2
-    brmi 2f
-    adiw r30, 4                 ; too far: k = 0
-    rjmp 4f
+    cpi t2, 0x0C                ; T >= 12 * 2^16: k = 0, which the table says from there on
+    brlo 2f                     ; as long as the instruction it jumps over
+    ldi t2, 0x0C
 2:
-    clr t0                      ; closer than the point itself (rounding of S2, or a reduced half_c2): T = 0
-    clr t1
-    clr t2
-3:
-    movw savedl, r30
-    mov r30, t1
-    mov r31, t2
-    andi r30, 0xFC              ; 4 * (T >> 10)
+    movw r26, r30
+    movw r30, t1
+    andi r30, 0xFE              ; 2 * (T >> 9)
     subi r30, lo8(-(sg_gp_exp_table))
     sbci r31, hi8(-(sg_gp_exp_table))
-    andi t1, 3                  ; fraction Q0.10
-    lpm byte, Z+                ; drop Q10.6
-    mul byte, t0
-    mov t2, r1
-    mul byte, t1
-    add t2, r0
-    mov carry2, r1
-    adc carry2, zero
-    lpm byte, Z+
-    mul byte, t0
-    add t2, r0
-    adc carry2, r1
-    mul byte, t1
-    add carry2, r0
-    adc r1, zero                ; r1:carry2 = drop * fraction >> 16
-    lpm t0, Z+                  ; level Q0.16
-    lpm t1, Z
-    sub t0, carry2
-    sbc t1, r1
-    movw r30, savedl
-    weigh \load, az0, az1, az2, az3
-    weigh \load, el0, el1, el2, el3
-4:
+    lsr t1
+    ror t0                      ; fraction (T >> 1) & 255
+    lpm t1, Z+                  ; level Q0.16
+    lpm t2, Z
+    fmul t2, t0                 ; carry:r1 = (level >> 8) * fraction >> 7
+    sbc t2, zero
+    sub t1, r1
+    sbc t2, zero
+    movw r30, r26
+    weigh \load, az0, az1, az2
+    weigh \load, el0, el1, el2
     dec left
-    breq 5f
+    breq 3f
     rjmp 1b
-5:
+3:
 .endm
 
-; void sg_gp_loop(struct sg_gp_sum *sum r25:r24, const uint8_t *record r23:r22, uint8_t n r20,
-;                 uint8_t space r18)
     .section .text.sg_gp_loop, "ax", @progbits
     .global sg_gp_loop
     .type sg_gp_loop, @function
@@ -170,44 +131,50 @@ sg_gp_loop:
     push r17
     push r28
     push r29
-    clr zero
-    mov left, r20
+    push r24                    ; sum
+    push r25
     movw r30, r22
     movw r28, r24
+    mov r0, r20
+    mov r1, r18
+    ldd s0l, Y+SUM_S
+    ldd s0h, Y+SUM_S+1
+    ldd s1l, Y+SUM_S+2
+    ldd s1h, Y+SUM_S+3
+    ldd s2l, Y+SUM_S+4
+    ldd s2h, Y+SUM_S+5
+    ldd s3l, Y+SUM_S+6
+    ldd s3h, Y+SUM_S+7
+    ldd s4l, Y+SUM_S+8
+    ldd s4h, Y+SUM_S+9
+    ldd s5l, Y+SUM_S+10
+    ldd s5h, Y+SUM_S+11
+    ldd square0, Y+SUM_S2
+    ldd square1, Y+SUM_S2+1
+    ldd square2, Y+SUM_S2+2
     ldd az0, Y+0
     ldd az1, Y+1
     ldd az2, Y+2
-    ldd az3, Y+3
     ldd el0, Y+4
     ldd el1, Y+5
     ldd el2, Y+6
-    ldd el3, Y+7
-    ldd s0l, Y+12
-    ldd s0h, Y+13
-    ldd s1l, Y+14
-    ldd s1h, Y+15
-    ldd s2l, Y+16
-    ldd s2h, Y+17
-    ldd s3l, Y+18
-    ldd s3h, Y+19
-    ldd s4l, Y+20
-    cpi r18, 1                  ; SG_ROM_FLASH
-    brne from_memory
+    mov left, r0
+    ldi zero, 0
+    sbrc r1, 0                  ; SG_ROM_FLASH
     rjmp from_flash
-from_memory:
     loop ld
     rjmp done
 from_flash:
     loop lpm
 done:
+    pop r29
+    pop r28
     std Y+0, az0
     std Y+1, az1
     std Y+2, az2
-    std Y+3, az3
     std Y+4, el0
     std Y+5, el1
     std Y+6, el2
-    std Y+7, el3
     clr r1
     pop r29
     pop r28
@@ -230,18 +197,72 @@ done:
     ret
     .size sg_gp_loop, . - sg_gp_loop
 
-; void sg_gp_trend(struct sg_gp_sum *sum r25:r24, const uint8_t *trend r23:r22, uint8_t space r20)
-#define acc0 r18
-#define acc1 r19
-#define acc2 r20
-#define acc3 r21
-#define low r22
-#define high r23
-#define factor r24
-#define count r25
-#define SUM_S 12
+; ---- The other loops: X walks s, Z the coefficients
+#undef c
+#undef zero
+#define zero r27                /* set after X is done with, or none is needed */
+#define low r18
+#define high r19
+#define factor r20
+#define count r21
+#define acc0 r22
+#define acc1 r23
+#define acc2 r24
+#define acc3 r25
 
-; acc = acc + trend * s over six channels; X walks s, Z walks trend
+; void sg_gp_square(struct sg_gp_sum *sum r25:r24)
+    .section .text.sg_gp_square, "ax", @progbits
+    .global sg_gp_square
+    .type sg_gp_square, @function
+sg_gp_square:
+    movw r30, r24
+    adiw r30, SUM_S
+    ldi acc0, 31
+    clr acc1
+    clr acc2
+    clr acc3
+    clr zero
+    ldi count, 6
+1:
+    ld low, Z+
+    ld high, Z+
+    mul low, low
+    add acc0, r0
+    adc acc1, r1
+    adc acc2, zero
+    adc acc3, zero
+    mul low, high               ; twice, below 2^13
+    lsl r0
+    rol r1
+    add acc1, r0
+    adc acc2, r1
+    adc acc3, zero
+    mul high, high              ; one byte
+    add acc2, r0
+    adc acc3, zero
+    dec count
+    brne 1b
+    ldi count, 3                ; >> 5 is << 3 and the upper three bytes
+2:
+    lsl acc0
+    rol acc1
+    rol acc2
+    rol acc3
+    dec count
+    brne 2b
+    sbiw r30, 24 - SUM_S2
+    st Z, acc1
+    std Z+1, acc2
+    std Z+2, acc3
+    std Z+3, zero
+    clr r1
+    ret
+    .size sg_gp_square, . - sg_gp_square
+
+; void sg_gp_trend(struct sg_gp_sum *sum r25:r24, const uint8_t *trend r23:r22, uint8_t space r20)
+#undef zero
+#define zero r17
+; acc = acc + trend * s over six channels
 .macro sum_trend load
     movw r26, r28
     adiw r26, SUM_S
@@ -260,22 +281,14 @@ done:
     adc acc2, r1
     adc acc3, zero
     \load factor, Z+
-    mul low, factor
+    mulsu factor, low
+    sbc acc3, zero              ; carry is the product's sign
     add acc1, r0
     adc acc2, r1
     adc acc3, zero
-    mul high, factor
+    mulsu factor, high
     add acc2, r0
     adc acc3, r1
-    \load factor, Z+
-    mul low, factor
-    add acc2, r0
-    adc acc3, r1
-    mul high, factor
-    add acc3, r0
-    \load factor, Z+
-    mul low, factor
-    add acc3, r0
     dec count
     brne 1b
 .endm
@@ -291,10 +304,17 @@ done:
 2:
     sum_trend ld
 3:
-    std Y+\at, acc0
-    std Y+\at+1, acc1
-    std Y+\at+2, acc2
-    std Y+\at+3, acc3
+    ldi count, 4                ; >> 4 is << 4 and the upper three bytes
+4:
+    lsl acc0
+    rol acc1
+    rol acc2
+    rol acc3
+    dec count
+    brne 4b
+    std Y+\at, acc1
+    std Y+\at+1, acc2
+    std Y+\at+2, acc3
 .endm
 
     .section .text.sg_gp_trend, "ax", @progbits
@@ -305,9 +325,9 @@ sg_gp_trend:
     push r28
     push r29
     clr zero
+    bst r20, 0                  ; T: SG_ROM_FLASH
     movw r28, r24
     movw r30, r22
-    bst r20, 0                  ; T: SG_ROM_FLASH
     output 0
     output 4
     pop r29
@@ -317,25 +337,22 @@ sg_gp_trend:
     ret
     .size sg_gp_trend, . - sg_gp_trend
 
-; int32_t sg_gp_project(const struct sg_gp_sum *sum r25:r24, const uint8_t *row r23:r22, uint8_t space r20)
-#define sum0 r22                /* 24 bits hold it */
-#define sum1 r23
-#define sum2 r24
-#define part r21
-
+; int16_t sg_gp_project(const struct sg_gp_sum *sum r25:r24, const uint8_t *row r23:r22, uint8_t space r20)
+#undef zero
+#define zero r25
 .macro project load
 1:
-    \load r20, Z+
-    ld part, X+
-    mulsu r20, part
-    sbc sum2, r18               ; carry is the product's sign
-    add sum0, r0
-    adc sum1, r1
-    adc sum2, r18
-    ld part, X+
-    mulsu r20, part
-    add sum1, r0
-    adc sum2, r1
+    \load factor, Z+
+    ld low, X+
+    mulsu factor, low
+    sbc acc2, zero              ; carry is the product's sign
+    add acc0, r0
+    adc acc1, r1
+    adc acc2, zero
+    ld low, X+
+    mulsu factor, low
+    add acc1, r0
+    adc acc2, r1
     dec count
     brne 1b
 .endm
@@ -347,12 +364,12 @@ sg_gp_project:
     movw r26, r24
     adiw r26, SUM_S
     movw r30, r22
-    clr r18
-    clr sum0
-    clr sum1
-    clr sum2
+    clr zero
+    clr acc0
+    clr acc1
+    clr acc2
     ldi count, 6
-    sbrs r20, 0
+    sbrs r20, 0                 ; SG_ROM_FLASH
     rjmp 2f
     project lpm
     rjmp 3f
@@ -360,9 +377,8 @@ sg_gp_project:
     project ld
 3:
     clr r1
-    clr r25
-    sbrc sum2, 7
-    com r25
+    mov r25, acc2               ; bytes 1 and 2 of the sum
+    mov r24, acc1
     ret
     .size sg_gp_project, . - sg_gp_project
 

@@ -3,12 +3,13 @@
 
 #include "sg_crc32_table.h"
 #include "sg_err.h"
+#include "sg_q.h"
 #include "sg_rom.h"
 
 #define HEAD(field) (offsetof(struct sg_model_head, field))
+#define TRUST(field) (SG_MODEL_PAGE + offsetof(struct sg_model_trust, field))
 #define GUARD(field) (offsetof(struct sg_model_guard, field))
 #define CRC_FROM 8U              // the CRC covers what follows it
-#define HALF_C2_TOP 0x40U        // top byte of 2^22
 
 static uint32_t crc32_byte(uint32_t crc, uint8_t byte)
 {
@@ -31,6 +32,18 @@ uint32_t sg_model_crc32(uint32_t crc, const uint8_t *data, size_t n)
     return ~crc;
 }
 
+// Bytes of the grid, 0 without one, or SG_E_BOUNDS.
+static int grid_bytes(const uint8_t *image, uint8_t space)
+{
+    const uint8_t wide = sg_rom_byte(image + TRUST(nodes), space);
+    const uint8_t high = sg_rom_byte(image + TRUST(nodes) + 1, space);
+    if (wide == 0 && high == 0)
+        return 0;
+    if (wide < 2 || wide > SG_MODEL_NODES_MAX || high < 2 || high > SG_MODEL_NODES_MAX)
+        return SG_E_BOUNDS;
+    return (int)((uint16_t)((uint16_t)wide * high) * SG_MODEL_NODE_BYTES);
+}
+
 int sg_model_length(const uint8_t *image, uint32_t room, uint8_t space)
 {
     if (room < SG_MODEL_HEAD_BYTES)
@@ -40,8 +53,12 @@ int sg_model_length(const uint8_t *image, uint32_t room, uint8_t space)
     if (sg_rom_u16(image + HEAD(version), space) != (uint16_t)SG_MODEL_VERSION)
         return SG_E_VERSION;
     const uint8_t vectors = sg_rom_byte(image + HEAD(vectors), space);
-    const uint16_t length = (uint16_t)(SG_MODEL_HEAD_BYTES + (uint16_t)vectors * SG_MODEL_RECORD_BYTES);
-    if (vectors < 1 || vectors > SG_MODEL_VECTORS_MAX || sg_rom_u32(image + HEAD(length), space) != length)
+    const int grid = grid_bytes(image, space);
+    if (vectors < 1 || vectors > SG_MODEL_VECTORS_MAX || grid < 0)
+        return SG_E_BOUNDS;
+    // at most 256 + 2880 + 234 * 12: 16 bits
+    const uint16_t length = (uint16_t)(SG_MODEL_HEAD_BYTES + (uint16_t)grid + (uint16_t)vectors * SG_MODEL_RECORD_BYTES);
+    if (length > SG_MODEL_SLOT_BYTES || sg_rom_u32(image + HEAD(length), space) != length)
         return SG_E_BOUNDS;
     if (length > room)
         return SG_E_SHORT;
@@ -60,39 +77,65 @@ static uint8_t any_bit(const uint8_t *data, uint8_t n, uint8_t space)
 // Fields of channels >= d that are not 0.
 static uint8_t unused_channel_bits(const uint8_t *image, uint8_t channels, uint8_t space)
 {
-    const uint8_t unused = (uint8_t)(SG_MODEL_CHANNELS - channels);
-    uint8_t bits = any_bit(image + HEAD(offset) + 2U * channels, (uint8_t)(2U * unused), space);
-    bits |= any_bit(image + HEAD(gain_q12) + 2U * channels, (uint8_t)(2U * unused), space);
-    bits |= any_bit(image + HEAD(trend[0]) + 4U * channels, (uint8_t)(4U * unused), space);
-    bits |= any_bit(image + HEAD(trend[1]) + 4U * channels, (uint8_t)(4U * unused), space);
-    return bits;
+    const uint8_t unused = (uint8_t)(2U * (SG_MODEL_CHANNELS - channels));
+    const uint8_t *first = image + 2U * channels;
+    return any_bit(first + HEAD(offset), unused, space) | any_bit(first + HEAD(gain_q12), unused, space)
+           | any_bit(first + HEAD(trend[0]), unused, space) | any_bit(first + HEAD(trend[1]), unused, space);
+}
+
+// Two's complement of 16 bits between two limits.
+static uint8_t within(uint16_t value, int16_t low, int16_t high)
+{
+    return sg_q_signed16(value) >= low && sg_q_signed16(value) <= high;
 }
 
 static int check_guards(const uint8_t *image, uint8_t guards, uint8_t channels, uint8_t space)
 {
-    const uint8_t *guard = image + SG_MODEL_PAGE;
-    for (uint8_t i = 0; i < guards; i++) {
-        // int32 in order as unsigned: flip the sign bit
-        const uint32_t low = sg_rom_u32(guard + GUARD(low), space) ^ 0x80000000UL;
-        const uint32_t high = sg_rom_u32(guard + GUARD(high), space) ^ 0x80000000UL;
-        if (low > high)
+    const uint8_t *guard = image + TRUST(guard);
+    for (uint8_t i = 0; i < guards; i++, guard += sizeof(struct sg_model_guard)) {
+        const uint16_t low = sg_rom_u16(guard + GUARD(low), space);
+        const uint16_t high = sg_rom_u16(guard + GUARD(high), space);
+        if (sg_q_signed16(low) > sg_q_signed16(high))
             return SG_E_BOUNDS;
-        if (any_bit(guard + GUARD(row) + channels, (uint8_t)(SG_MODEL_CHANNELS + 2 - channels), space))
-            return SG_E_BOUNDS;  // row entries of unused channels, and the reserved bytes behind them
-        guard += sizeof(struct sg_model_guard);
+        if (!within(sg_rom_u16(guard + GUARD(base), space), -16384, 16384))
+            return SG_E_BOUNDS;
+        if (any_bit(guard + GUARD(row) + channels, (uint8_t)(SG_MODEL_CHANNELS - channels), space))
+            return SG_E_BOUNDS;
     }
-    const uint8_t unused = (uint8_t)((8U - guards) * sizeof(struct sg_model_guard));
+    const uint8_t unused = (uint8_t)((SG_MODEL_GUARDS - guards) * sizeof(struct sg_model_guard));
     return any_bit(guard, unused, space) ? SG_E_BOUNDS : SG_OK;
+}
+
+static int check_grid(const uint8_t *image, uint16_t bytes, uint8_t guards, uint8_t space)
+{
+    for (uint8_t i = 0; i < 2; i++) {
+        if (!within(sg_rom_u16(image + TRUST(origin_deg_q7) + 2U * i, space), -16384, 16384))
+            return SG_E_BOUNDS;
+        if (bytes && !sg_rom_byte(image + TRUST(scale) + i, space))
+            return SG_E_BOUNDS;
+    }
+    const uint8_t *node = image + SG_MODEL_HEAD_BYTES;
+    for (; bytes != 0; bytes -= SG_MODEL_NODE_BYTES, node += SG_MODEL_NODE_BYTES) {
+        if (any_bit(node + guards, (uint8_t)(SG_MODEL_GUARDS - guards), space))
+            return SG_E_BOUNDS;
+        if (!sg_rom_byte(node + SG_MODEL_GUARDS, space))
+            return SG_E_BOUNDS;
+    }
+    return SG_OK;
 }
 
 static int check_records(const uint8_t *record, uint8_t vectors, uint8_t channels, uint8_t space)
 {
-    for (; vectors != 0; vectors--) {
-        if (sg_rom_byte(record + 2, space) >= HALF_C2_TOP)
+    for (; vectors != 0; vectors--, record += SG_MODEL_RECORD_BYTES) {
+        uint32_t c2 = 31;       // rounds 8 * sum c^2 / 256 up
+        for (uint8_t j = 0; j < SG_MODEL_CHANNELS; j++) {
+            const uint8_t c = sg_rom_byte(record + 2 + j, space);
+            if (c && j >= channels)
+                return SG_E_BOUNDS;
+            c2 += (uint16_t)((uint16_t)c * c);
+        }
+        if (sg_rom_u16(record, space) != (uint16_t)(c2 >> 5))
             return SG_E_BOUNDS;
-        if (any_bit(record + 3 + channels, (uint8_t)(SG_MODEL_CHANNELS - channels), space))
-            return SG_E_BOUNDS;
-        record += SG_MODEL_RECORD_BYTES;
     }
     return SG_OK;
 }
@@ -108,20 +151,30 @@ int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint
     const uint8_t vectors = sg_rom_byte(image + HEAD(vectors), space);
     const uint8_t channels = sg_rom_byte(image + HEAD(channels), space);
     const uint8_t weight_frac_bits = sg_rom_byte(image + HEAD(weight_frac_bits), space);
-    const uint8_t guards = sg_rom_byte(image + HEAD(guards), space);
-    if (channels < 1 || channels > SG_MODEL_CHANNELS || guards > 8)
+    const uint8_t guards = sg_rom_byte(image + TRUST(guards), space);
+    const uint16_t grid = (uint16_t)grid_bytes(image, space);   // sg_model_length has found it good
+    const uint16_t records = (uint16_t)(SG_MODEL_HEAD_BYTES + grid);
+    if (channels < 1 || channels > SG_MODEL_CHANNELS || guards > SG_MODEL_GUARDS)
         return SG_E_BOUNDS;
-    if (weight_frac_bits < 6 || weight_frac_bits > 10)
+    if (weight_frac_bits < 5 || weight_frac_bits > 9)
         return SG_E_BOUNDS;
     if (sg_rom_byte(image + HEAD(kernel), space) != SG_KERNEL_RBF)
         return SG_E_BOUNDS;
-    if (any_bit(image + HEAD(reserved), sizeof(struct sg_model_head) - HEAD(reserved), space))
+    for (uint8_t i = 0; i < 8; i += 4) {
+        const int32_t bias = sg_q_signed32(sg_rom_u32(image + HEAD(bias) + i, space));
+        if (bias > 0x40000000L || bias < -0x40000000L)
+            return SG_E_BOUNDS;
+    }
+    if (any_bit(image + HEAD(pad), sizeof(struct sg_model_head) - HEAD(pad), space)
+        || any_bit(image + TRUST(pad), SG_MODEL_HEAD_BYTES - TRUST(pad), space))
         return SG_E_BOUNDS;
     if (unused_channel_bits(image, channels, space))
         return SG_E_BOUNDS;
     int verdict = check_guards(image, guards, channels, space);
     if (verdict == SG_OK)
-        verdict = check_records(image + SG_MODEL_HEAD_BYTES, vectors, channels, space);
+        verdict = check_grid(image, grid, guards, space);
+    if (verdict == SG_OK)
+        verdict = check_records(image + records, vectors, channels, space);
     if (verdict != SG_OK)
         return verdict;
 
@@ -129,12 +182,11 @@ int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint
     view->crc = crc;
     view->generation = sg_rom_u32(image + HEAD(generation), space);
     view->length = (uint16_t)length;
+    view->records = records;
     view->space = space;
     view->vectors = vectors;
     view->channels = channels;
-    view->guards = guards;
     view->weight_frac_bits = weight_frac_bits;
-    view->reserved = 0;
     return SG_OK;
 }
 

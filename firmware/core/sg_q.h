@@ -26,6 +26,12 @@ static inline int32_t sg_q_round_shift(int32_t x, uint8_t bits)
     return ((x >> (bits - 1U)) + 1) >> 1;
 }
 
+// Two's complement value of 16 bits.
+static inline int16_t sg_q_signed16(uint16_t x)
+{
+    return x <= INT16_MAX ? (int16_t)x : (int16_t)(-1 - (int16_t)(UINT16_MAX - x));
+}
+
 // Two's complement value of 32 bits; spelled out because the C conversion is implementation-defined.
 static inline int32_t sg_q_signed32(uint32_t x)
 {

@@ -55,18 +55,20 @@ int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], 
     uint8_t flags = raw_flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_EXPOSURE | SG_FLAG_TRIAL
                                  | SG_FLAG_RECOVERING);
     int16_t deg_q7[2] = { 0, 0 };
+    uint8_t sigma_log2_q4 = SG_GP_SIGMA_UNKNOWN;
     int result = SG_OK;
 
     if (view == NULL) {
         flags |= SG_FLAG_NO_MODEL;
     } else {
-        uint8_t seen;
-        result = sg_gp_predict(view, feature, deg_q7, &seen);
+        struct sg_gp_point point;
+        result = sg_gp_predict(view, feature, &point);
+        deg_q7[0] = point.deg_q7[0];
+        deg_q7[1] = point.deg_q7[1];
         if (!correct(recentre, deg_q7))
             result = SG_E_RANGE;
-        if (result != SG_OK)
-            seen = SG_FLAG_OUT_OF_RANGE;
-        flags |= seen;
+        flags |= result == SG_OK ? point.flags : (uint8_t)SG_FLAG_OUT_OF_RANGE;
+        sigma_log2_q4 = result == SG_OK ? point.sigma_log2_q4 : (uint8_t)SG_GP_SIGMA_HUGE;
         if (!(flags & (SG_FLAG_OUT_OF_RANGE | SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_RECOVERING)))
             flags |= SG_FLAG_VALID;
     }
@@ -75,6 +77,6 @@ int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], 
     out->elevation_deg_q7 = deg_q7[1];
     out->infer_us = 0;
     out->flags = flags;
-    out->sigma_log2_q4 = 0;
+    out->sigma_log2_q4 = sigma_log2_q4;
     return result;
 }

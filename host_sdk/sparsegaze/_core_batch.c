@@ -5,6 +5,7 @@
 
 #include "sg_err.h"
 #include "sg_expose.h"
+#include "sg_gp.h"
 #include "sg_mlp.h"
 #include "sg_track.h"
 
@@ -13,6 +14,10 @@
 // Returns SG_OK, or SG_E_RANGE if any sample saturated.
 int sg_batch_infer(const struct sg_model_view *view, const uint16_t *features, const uint8_t *raw_flags,
                    const struct sg_affine *recentre, struct sg_gaze *out, size_t n);
+
+// sg_gp_predict over n samples. features[n * 6]; out[n]. Returns SG_OK, or SG_E_RANGE if any sample saturated.
+int sg_batch_predict(const struct sg_model_view *view, const uint16_t *features, struct sg_gp_point *out,
+                     size_t n);
 
 // sg_expose_feature over n readings. flags[n] or NULL.
 void sg_batch_feature(const uint16_t *code_q2, const uint16_t *exposure_cycles, uint16_t *feature,
@@ -31,6 +36,18 @@ int sg_batch_infer(const struct sg_model_view *view, const uint16_t *features, c
         const uint8_t flags = raw_flags == NULL ? 0 : raw_flags[i];
         const uint16_t *feature = features + i * SG_MODEL_CHANNELS;
         const int result = sg_track_infer(view, feature, flags, recentre, out + i);
+        if (result != SG_OK)
+            worst = result;
+    }
+    return worst;
+}
+
+int sg_batch_predict(const struct sg_model_view *view, const uint16_t *features, struct sg_gp_point *out,
+                     size_t n)
+{
+    int worst = SG_OK;
+    for (size_t i = 0; i < n; i++) {
+        const int result = sg_gp_predict(view, features + i * SG_MODEL_CHANNELS, out + i);
         if (result != SG_OK)
             worst = result;
     }

@@ -19,8 +19,9 @@ from threadpoolctl import threadpool_limits
 from .errors import CalibrationError, ModelError
 from .fixations import TARGETS_NEEDED, fixations
 from .gp import GaussianProcess
-from .model import CHANNELS, GUARDS_MAX, S_FRAC, S_MAX, U_STEPS, VECTORS_MAX, DeviceModel, emulate, quantise
+from .model import CHANNELS, S_FRAC, S_MAX, U_STEPS, VECTORS_MAX, DeviceModel, emulate, quantise
 from .rounding import assemble
+from .trust import GUARDS, Trust
 
 BOX_MARGIN = 0.12  # of a channel's calibrated range, on each side
 BOX_SIGMAS = 6.0  # and at least this many frame-noise deviations
@@ -239,7 +240,7 @@ def maximin(rng, x, count):
 
 
 def guards(features, offset, gain, noise):
-    """Bounds along the principal directions of the calibrated cloud: list of (low, high, row int8 [d]).
+    """Bounds along the least principal directions of the calibrated cloud: Trust.
 
     Blinks and slip leave the cloud in directions in which gaze does not move it, long before a single channel
     leaves its own range.
@@ -248,17 +249,20 @@ def guards(features, offset, gain, noise):
     live = np.flatnonzero(gain > 0)
     step_noise = (noise * gain / 4096.0)[live]
     _, directions = np.linalg.eigh(np.cov(s[:, live].T).reshape(len(live), len(live)))
-    result = []
-    for direction in directions.T[::-1][:GUARDS_MAX]:
+    rows, low, high = [], [], []
+    for direction in directions.T[:GUARDS]:  # least variance first: gaze does not move these
         direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
         row = np.zeros(s.shape[1], np.int64)
         row[live] = np.rint(127.0 * direction / np.abs(direction).max())
-        projection = s @ row
-        low, high = np.quantile(projection, [TAIL, 1 - TAIL])
-        spread = float(np.sqrt(row[live] ** 2 @ step_noise**2))
-        margin = max(GUARD_MARGIN * (high - low), GUARD_SIGMAS * spread)
-        result.append((int(np.floor(low - margin)), int(np.ceil(high + margin)), row))
-    return result
+        projection = s @ row >> 8
+        least, most = np.quantile(projection, [TAIL, 1 - TAIL])
+        spread = float(np.sqrt(row[live] ** 2 @ step_noise**2)) / 256
+        margin = max(GUARD_MARGIN * (most - least), GUARD_SIGMAS * spread)
+        rows.append(row)
+        low.append(int(np.floor(least - margin)))
+        high.append(int(np.ceil(most + margin)))
+    none = np.zeros(len(rows), np.int64)
+    return Trust(np.array(rows), none, np.array(low), np.array(high), np.zeros((0, 0, len(rows)), np.int64))
 
 
 @dataclass(frozen=True)

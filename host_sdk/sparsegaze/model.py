@@ -9,27 +9,30 @@ two against each other bit for bit.
 
 import os
 import zlib
+from typing import NamedTuple
 
 import numpy as np
 
 from .errors import ModelError
+from .fields import put
+from .trust import Trust, sigma_deg
 
 MAGIC = 0x4D475A47
-VERSION = 1
+VERSION = 2
 PAGE_BYTES = 128
 HEAD_BYTES = 2 * PAGE_BYTES
-RECORD_BYTES = 13
+RECORD_BYTES = 12
 CHANNELS = 6
 SLOT_BYTES = 3072
 VECTORS_MAX = (SLOT_BYTES - HEAD_BYTES) // RECORD_BYTES
-GUARDS_MAX = 8
-WEIGHT_FRAC_BITS = range(6, 11)
+WEIGHT_FRAC_BITS = range(5, 10)
+BIAS_MAX = 1 << 30
 KERNEL_RBF = 0
 
 S_MAX = 4095  # largest input, u8.4
 S_FRAC = 16  # input steps per centre step
-U_STEPS = np.sqrt(4096.0 / np.log(2.0))  # centre steps per length scale: T >> 16 then counts halvings
-T_END = 1 << 20  # the kernel is 0 from here on
+U_STEPS = 64.0  # centre steps per length scale: T >> 16 then counts e-folds
+TABLE_END = 1536  # of T >> 9: the kernel is 0 from here on
 
 FLAG_VALID, FLAG_NO_MODEL, FLAG_OUT_OF_RANGE = 1, 2, 4
 FLAG_SATURATED, FLAG_STARVED = 8, 16
@@ -42,7 +45,7 @@ HEAD = np.dtype(
         ("generation", "<u4"),
         ("length", "<u4"),
         ("bias", "<i4", (2,)),
-        ("trend", "<i4", (2, CHANNELS)),
+        ("trend", "<i2", (2, CHANNELS)),
         ("offset", "<u2", (CHANNELS,)),
         ("gain_q12", "<u2", (CHANNELS,)),
         ("version", "<u2"),
@@ -50,15 +53,35 @@ HEAD = np.dtype(
         ("channels", "u1"),
         ("kernel", "u1"),
         ("weight_frac_bits", "u1"),
-        ("guards", "u1"),
-        ("reserved", "u1"),
-        ("pad", "u1", (24,)),
+        ("pad", "u1", (50,)),
     ]
 )
-GUARD = np.dtype([("low", "<i4"), ("high", "<i4"), ("row", "i1", (CHANNELS,)), ("reserved", "u1", (2,))])
-RECORD = np.dtype([("half_c2", "u1", (3,)), ("c", "u1", (CHANNELS,)), ("weight", "<i2", (2,))])
+RECORD = np.dtype([("half_c2", "<u2"), ("c", "u1", (CHANNELS,)), ("weight", "<i2", (2,))])
+
+GAZE = np.dtype(
+    [
+        ("t_us", "<u4"),
+        ("azimuth_deg_q7", "<i2"),
+        ("elevation_deg_q7", "<i2"),
+        ("infer_us", "<u2"),
+        ("flags", "u1"),
+        ("sigma_log2_q4", "u1"),
+    ]
+)
+POINT = np.dtype([("deg_q7", "<i2", (2,)), ("doubt", "<u2"), ("sigma", "u1"), ("flags", "u1")])
 
 _REFIT = "fit the recording again (sparsegaze fit) or copy the file again"
+
+
+class Judged(NamedTuple):
+    """gaze_deg float64 [n, 2]; outside bool [n]; sigma_deg [n] of each angle (nan unknown);
+    doubt [n], squared distance from what gaze explains, in standard deviations.
+    """
+
+    gaze_deg: np.ndarray
+    outside: np.ndarray
+    sigma_deg: np.ndarray
+    doubt: np.ndarray
 
 
 class DeviceModel:
@@ -71,20 +94,21 @@ class DeviceModel:
     def __init__(self, image):
         self.image = _checked(bytes(image))
         self._head = np.frombuffer(self.image, HEAD, 1)[0]
-        self._guards = np.frombuffer(self.image, GUARD, GUARDS_MAX, PAGE_BYTES)[: int(self._head["guards"])]
-        self._records = np.frombuffer(self.image, RECORD, self.vectors, HEAD_BYTES)
+        self._records = np.frombuffer(
+            self.image, RECORD, self.vectors, len(self.image) - self.vectors * RECORD_BYTES
+        )
         self._view = None
 
     @classmethod
     def from_parts(
-        cls, offset, gain_q12, bias, trend, centres, weights, weight_frac_bits, guards=(), generation=0
+        cls, offset, gain_q12, bias, trend, centres, weights, weight_frac_bits, trust=None, generation=0
     ):
         """Pack a model.
 
         offset, gain_q12   [d] feature units and s steps per feature step (Q4.12); gain 0 drops the channel
-        bias, trend        [2], [2, d] signed 32 bit, 2^-(weight_frac_bits + 16) deg (trend: per step of s)
+        bias, trend        [2], [2, d] integers, 2^-(weight_frac_bits + 12) deg (trend: 16 bits, per step of s)
         centres            [n, d] 0..255;  weights [n, 2] signed 16 bit, unit 2^-weight_frac_bits deg
-        guards             up to 8 of (low, high, row [d] signed 8 bit)
+        trust              trust.Trust, or None for a model that flags only what leaves the box
         Raises ModelError for a value that its field cannot hold.
         """
         centres, weights = np.asarray(centres), np.asarray(weights)
@@ -94,33 +118,28 @@ class DeviceModel:
                 "record with a board of at most six LEDs",
             )
         n, d = centres.shape
-        if not 1 <= n <= VECTORS_MAX:
+        trust = trust or Trust()
+        page, grid = trust.pack(d)
+        room = (SLOT_BYTES - HEAD_BYTES - len(grid)) // RECORD_BYTES
+        if not 1 <= n <= room:
             raise ModelError(
-                f"{n} calibration vectors do not fit a slot of {VECTORS_MAX}", "ask for fewer vectors"
+                f"{n} calibration vectors do not fit a slot of {room}", f"ask for 1 to {room} vectors"
             )
-        if len(guards) > GUARDS_MAX:
-            raise ModelError(f"{len(guards)} guards do not fit a page of {GUARDS_MAX}", "use fewer guards")
         head = np.zeros(1, HEAD)
         head["magic"], head["version"], head["kernel"] = MAGIC, VERSION, KERNEL_RBF
-        head["length"] = HEAD_BYTES + n * RECORD_BYTES
-        head["vectors"], head["channels"], head["guards"] = n, d, len(guards)
-        _put(head, "generation", generation, ())
-        _put(head, "weight_frac_bits", weight_frac_bits, ())
-        _put(head, "bias", bias, (2,))
-        _put(head, "trend", trend, (2, d))
-        _put(head, "offset", offset, (d,))
-        _put(head, "gain_q12", gain_q12, (d,))
-        guard_page = np.zeros(GUARDS_MAX, GUARD)
-        for row, (low, high, coefficients) in zip(guard_page, guards):
-            _put(row, "low", low, ())
-            _put(row, "high", high, ())
-            _put(row, "row", coefficients, (d,))
+        head["length"] = HEAD_BYTES + len(grid) + n * RECORD_BYTES
+        head["vectors"], head["channels"] = n, d
+        put(head, "generation", generation, ())
+        put(head, "weight_frac_bits", weight_frac_bits, ())
+        put(head, "bias", bias, (2,))
+        put(head, "trend", trend, (2, d))
+        put(head, "offset", offset, (d,))
+        put(head, "gain_q12", gain_q12, (d,))
         records = np.zeros(n, RECORD)
-        _put(records, "c", centres, (n, d))
-        _put(records, "weight", weights, (n, 2))
-        half = 8 * np.sum(centres.astype(np.int64) ** 2, axis=1)
-        records["half_c2"] = np.stack([half & 255, half >> 8 & 255, half >> 16], axis=1)
-        return cls(_sealed(head.tobytes() + guard_page.tobytes() + records.tobytes()))
+        put(records, "c", centres, (n, d))
+        put(records, "weight", weights, (n, 2))
+        records["half_c2"] = half_squares(centres)
+        return cls(_sealed(head.tobytes() + page + grid + records.tobytes()))
 
     @classmethod
     def load(cls, path):
@@ -161,7 +180,7 @@ class DeviceModel:
     def with_generation(self, generation):
         """The same model with another generation number (0..2^32-1) and the CRC that belongs to it."""
         head = np.frombuffer(self.image, HEAD, 1).copy()
-        _put(head, "generation", generation, ())
+        put(head, "generation", generation, ())
         return DeviceModel(_sealed(head.tobytes() + self.image[PAGE_BYTES:]))
 
     crc = property(lambda self: int(self._head["crc"]))
@@ -175,10 +194,7 @@ class DeviceModel:
     trend = property(lambda self: self._head["trend"].astype(np.int64))
     centres = property(lambda self: self._records["c"].astype(np.int64))
     weights = property(lambda self: self._records["weight"].astype(np.int64))
-    half_c2 = property(lambda self: self._records["half_c2"].astype(np.int64) @ np.array([1, 256, 65536]))
-    guards = property(
-        lambda self: [(int(g["low"]), int(g["high"]), g["row"].astype(np.int64)) for g in self._guards]
-    )
+    trust = property(lambda self: Trust.unpack(self.image[PAGE_BYTES : len(self.image) - self.vectors * RECORD_BYTES]))
 
     def predict(self, features, recentre_deg=(0.0, 0.0)):
         """Gaze by the firmware's own code.
@@ -186,12 +202,41 @@ class DeviceModel:
         features       uint16 [n, d], d = .channels or 6
         recentre_deg   azimuth and elevation added to the output, rounded to 1/128 deg
         Returns (azimuth_deg [n], elevation_deg [n], flags uint8 [n]); without FLAG_VALID it means nothing.
+        `judge` tells sigma too.
         Raises ModelError when d does not fit the model.
         """
         from . import _core
 
         ffi, lib = _core.ffi, _core.lib
         features = self._six(features)
+        out = np.zeros(len(features), GAZE)
+        recentre = ffi.new("struct sg_affine *", {"offset_deg_q7": recentre_q7(recentre_deg).tolist()})
+        gaze = ffi.cast("struct sg_gaze *", ffi.from_buffer(out, require_writable=True))
+        lib.sg_batch_infer(
+            self._opened(), ffi.from_buffer("uint16_t[]", features), ffi.NULL, recentre, gaze, len(features)
+        )
+        return out["azimuth_deg_q7"] / DEG_Q7, out["elevation_deg_q7"] / DEG_Q7, out["flags"].copy()
+
+    def judge(self, features):
+        """Gaze and what the device knows of its error, by the firmware's own code: Judged; features as above."""
+        from . import _core
+
+        ffi, lib = _core.ffi, _core.lib
+        features = self._six(features)
+        out = np.zeros(len(features), POINT)
+        points = ffi.cast("struct sg_gp_point *", ffi.from_buffer(out, require_writable=True))
+        lib.sg_batch_predict(self._opened(), ffi.from_buffer("uint16_t[]", features), points, len(features))
+        return Judged(
+            out["deg_q7"] / DEG_Q7,
+            (out["flags"] & FLAG_OUT_OF_RANGE) != 0,
+            sigma_deg(out["sigma"]),
+            out["doubt"] / 256.0,
+        )
+
+    def _opened(self):
+        from . import _core
+
+        ffi, lib = _core.ffi, _core.lib
         if self._view is None:
             buffer = ffi.from_buffer("uint8_t[]", self.image)
             view = ffi.new("struct sg_model_view *")
@@ -199,25 +244,7 @@ class DeviceModel:
             if status < 0:
                 raise ModelError(f"the core refuses this model (error {status})", _REFIT)
             self._view = (view, buffer)  # the view borrows the image
-        out = np.zeros(
-            len(features),
-            np.dtype(
-                [
-                    ("t_us", "<u4"),
-                    ("azimuth_deg_q7", "<i2"),
-                    ("elevation_deg_q7", "<i2"),
-                    ("infer_us", "<u2"),
-                    ("flags", "u1"),
-                    ("sigma_log2_q4", "u1"),
-                ]
-            ),
-        )
-        recentre = ffi.new("struct sg_affine *", {"offset_deg_q7": recentre_q7(recentre_deg).tolist()})
-        gaze = ffi.cast("struct sg_gaze *", ffi.from_buffer(out, require_writable=True))
-        lib.sg_batch_infer(
-            self._view[0], ffi.from_buffer("uint16_t[]", features), ffi.NULL, recentre, gaze, len(features)
-        )
-        return out["azimuth_deg_q7"] / DEG_Q7, out["elevation_deg_q7"] / DEG_Q7, out["flags"].copy()
+        return self._view[0]
 
     def _six(self, features):
         features = np.asarray(features)
@@ -241,35 +268,40 @@ def quantise(features, offset, gain_q12):
     return s, np.any(s != scaled, axis=1)
 
 
+def half_squares(centres):
+    """8 sum c^2 of centres [m, d] in units of 256, rounded up: int64 [m]. Weights take the difference."""
+    return (np.sum(np.asarray(centres, np.int64) ** 2, axis=1) + 31) >> 5
+
+
 def kernel_table():
-    """The kernel's table over T >> 10: level and 64 times the fall to the next entry, int64 [1024] each.
-
-    The chord lies above the curve, by half of (ln 2 / 64)^2 / 8 on average, and the device floors the
-    interpolated fall: both means are taken off the nodes.
-    """
-    level = 65536.0 * 2.0 ** (-np.arange(1025) / 64.0) * (1.0 - (np.log(2.0) / 64.0) ** 2 / 16.0) - 0.5
-    level = np.floor(level + 0.5).astype(np.int64)
-    return level[:-1], (level[:-1] - level[1:]) * 64
+    """The kernel's table over T >> 9, int64 [TABLE_END + 1]; it ends in zeros."""
+    level = np.floor(65536.0 * np.exp(-np.arange(TABLE_END + 1) / 128.0)).astype(np.int64)
+    return np.minimum(level, 65535)
 
 
-_LEVEL, _FALL = kernel_table()
+_LEVEL = kernel_table()
 
 
-def kernel_q16(s, centres, half_c2=None):
+def kernel_q16(s, centres):
     """Kernel values as the device computes them.
 
     s [n, d] u8.4, centres [m, d] 0..255.  Returns int64 [n, m], Q0.16.
     """
     s, centres = np.asarray(s, np.int64), np.asarray(centres, np.int64)
-    if half_c2 is None:
-        half_c2 = 8 * np.sum(centres**2, axis=1)
     # Exact in float64: every product is below 2^20 and every sum below 2^24.
     cross = (s.astype(float) @ centres.T.astype(float)).astype(np.int64)
-    t = np.maximum((np.sum(s * s, axis=1) >> 5)[:, None] + half_c2 - cross, 0)
-    inside = t < T_END
-    t = np.where(inside, t, 0)
-    k = _LEVEL[t >> 10] - (_FALL[t >> 10] * (t & 1023) >> 16)
-    return np.where(inside, k, 0)
+    t = ((np.sum(s * s, axis=1) + 31) >> 5)[:, None] + 256 * half_squares(centres) - cross
+    level = _LEVEL[np.minimum(t >> 9, TABLE_END)]
+    return level - ((level >> 8) * (t >> 1 & 255) >> 7)
+
+
+def weighed(k, weights):
+    """sum of weight * k as the device forms it, without the products of the low bytes.
+
+    k int64 [n, m] Q0.16, weights int64 [m, 2].  Returns int64 [n, 2], unit 2^-(weight_frac_bits + 8) deg.
+    """
+    whole = k @ weights - (k & 255) @ (weights & 255)
+    return whole >> 8  # a multiple of 256
 
 
 def emulate(model, features, recentre_deg=(0.0, 0.0)):
@@ -277,22 +309,31 @@ def emulate(model, features, recentre_deg=(0.0, 0.0)):
 
     Returns (azimuth_q7 int64 [n], elevation_q7 int64 [n], flags uint8 [n]) as struct sg_gaze has them.
     """
-    features = model._six(features)
-    s, outside = quantise(features, model.offset, model.gain_q12)
-    for low, high, row in model.guards:
-        projection = s @ row
-        outside |= (projection < low) | (projection > high)
-    k = kernel_q16(s, model.centres, model.half_c2)
-    total = model.bias + s @ model.trend.T + k @ model.weights
-    total = (total + 2**31) % 2**32 - 2**31
-    shift = model.weight_frac_bits + 16 - 7
-    q7 = (total + (1 << shift - 1)) >> shift
+    q7, outside, _, _ = emulate_point(model, features)
     model_gaze = np.clip(q7, -32768, 32767)
     moved = model_gaze + recentre_q7(recentre_deg)
     gaze = np.clip(moved, -32768, 32767)
-    outside |= np.any((q7 != model_gaze) | (moved != gaze), axis=1)
+    outside = outside | np.any(moved != gaze, axis=1)
     flags = np.where(outside, FLAG_OUT_OF_RANGE, FLAG_VALID).astype(np.uint8)
     return gaze[:, 0], gaze[:, 1], flags
+
+
+def emulate_point(model, features):
+    """What struct sg_gp_point holds: (q7 int64 [n, 2], outside bool [n], doubt int64 [n], sigma code int64 [n]).
+
+    q7 before it saturates.
+    """
+    s, outside = quantise(model._six(features), model._head["offset"], model._head["gain_q12"])
+    centres = model._records["c"].astype(np.int64)
+    trend = model._head["trend"].astype(np.int64)
+    total = (model.bias + s @ trend.T) >> 4
+    total = total + weighed(kernel_q16(s, centres), model.weights)
+    total = (total + 2**23) % 2**24 - 2**23
+    shift = model.weight_frac_bits + 1
+    q7 = (total + (1 << shift - 1)) >> shift
+    gaze = np.clip(q7, -32768, 32767)
+    outside = outside | np.any(q7 != gaze, axis=1)
+    return (q7, *model.trust.judge(s, gaze, outside))
 
 
 def recentre_q7(recentre_deg):
@@ -317,7 +358,9 @@ def _checked(image):
             "fit the recording again with this version of sparsegaze",
         )
     length, n, d = int(head["length"]), int(head["vectors"]), int(head["channels"])
-    if not 1 <= n <= VECTORS_MAX or length != HEAD_BYTES + n * RECORD_BYTES:
+    trust = Trust.unpack(image[PAGE_BYTES:])
+    grid = trust.grid_bytes
+    if not 1 <= n <= VECTORS_MAX or length != HEAD_BYTES + grid + n * RECORD_BYTES or length > SLOT_BYTES:
         raise ModelError(f"the model states {n} vectors in {length} bytes, which cannot be", _REFIT)
     if not 1 <= d <= CHANNELS:
         raise ModelError(
@@ -329,24 +372,18 @@ def _checked(image):
     if zlib.crc32(image[8:]) != int(head["crc"]):
         raise ModelError("the model is damaged (its checksum does not match)", _REFIT)
     unused = slice(d, CHANNELS)
-    guards = np.frombuffer(image, GUARD, GUARDS_MAX, PAGE_BYTES)
-    idle = image[PAGE_BYTES + int(head["guards"]) * GUARD.itemsize : HEAD_BYTES]
-    records = np.frombuffer(image, RECORD, n, HEAD_BYTES)
+    records = np.frombuffer(image, RECORD, n, HEAD_BYTES + grid)
     if (
         head["kernel"] != KERNEL_RBF
         or head["weight_frac_bits"] not in WEIGHT_FRAC_BITS
-        or head["guards"] > GUARDS_MAX
-        or head["reserved"]
+        or np.any(np.abs(head["bias"].astype(np.int64)) > BIAS_MAX)
         or np.any(head["pad"])
-        or np.any(guards["reserved"])
-        or any(idle)
-        or np.any(guards["low"] > guards["high"])
-        or np.any(guards["row"][:, unused])
         or np.any(head["offset"][unused])
         or np.any(head["gain_q12"][unused])
         or np.any(head["trend"][:, unused])
         or np.any(records["c"][:, unused])
-        or np.any(records["half_c2"][:, 2] >= 0x40)
+        or np.any(records["half_c2"] != half_squares(records["c"]))
+        or not trust.sound(image[PAGE_BYTES : HEAD_BYTES + grid], d)
     ):
         raise ModelError("the model has fields that this format does not allow", _REFIT)
     return image
@@ -354,23 +391,3 @@ def _checked(image):
 
 def _sealed(image):
     return image[:4] + zlib.crc32(image[8:]).to_bytes(4, "little") + image[8:]
-
-
-def _put(target, field, value, shape):
-    """Assign integers to the leading part of a field; ModelError instead of wrapping round."""
-    value = np.asarray(value)
-    if value.shape != shape or not np.issubdtype(value.dtype, np.integer):
-        raise ModelError(
-            f"{field} must be integers of shape {shape}, not {value.dtype} {value.shape}",
-            "this is a bug: report it with the recording",
-        )
-    limits = np.iinfo(target[field].dtype)
-    if value.size and (value.min() < limits.min or value.max() > limits.max):
-        raise ModelError(
-            f"{field} reaches {value.min()}..{value.max()}; it holds {limits.min}..{limits.max}",
-            "this is a bug: report it with the recording",
-        )
-    if shape == ():
-        target[field] = value
-    else:
-        target[field][..., : shape[-1]] = value

@@ -4,7 +4,7 @@
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from .model import S_FRAC, S_MAX, U_STEPS, WEIGHT_FRAC_BITS, DeviceModel, kernel_q16
+from .model import BIAS_MAX, S_FRAC, S_MAX, U_STEPS, WEIGHT_FRAC_BITS, DeviceModel, kernel_q16
 
 KERNEL_ERROR = 3.0  # of a device kernel value, Q0.16 steps
 CELL, CELLS_MAX = 0.2, 20_000  # length scales; see reach()
@@ -23,18 +23,18 @@ def assemble(s, target, centres, offset, gain, rails, ridge):
     normal = design.T @ design
     for bits in reversed(WEIGHT_FRAC_BITS):
         damped = normal + np.diag(np.r_[np.full(n, ridge), np.full(d, 1e-9), 0.0]) * len(s)
-        fine = 2.0 ** -(bits + 16)
-        unit = np.r_[np.full(n, 2.0**-bits), np.full(d, 4096.0 * fine), fine]
+        fine, trend_unit = 2.0 ** -(bits + 8), 2.0 ** -(bits + 12)
+        unit = np.r_[np.full(n, 2.0**-bits), np.full(d, 4096.0 * trend_unit), trend_unit]
         whole = _round_in_turn(
             damped, design.T @ target, unit, np.r_[np.arange(n, n + d), np.arange(n), n + d]
         )
         weights, trend, bias = whole[:n], whole[n : n + d].T, whole[-1]
-        if np.abs(weights).max() > 32767 or np.abs(whole[n:]).max() >= 2**31:
+        if np.abs(weights).max() > 32767 or np.abs(trend).max() > 32767 or np.abs(bias).max() > BIAS_MAX:
             continue
         bound = reach(weights, trend, bias, centres, rails)
-        if bound < 2**31:
+        if bound < 2**23:
             model = DeviceModel.from_parts(offset, gain, bias, trend, centres, weights, bits, rails)
-            return model, (float(bound * fine), float(2**31 * fine))
+            return model, (float(bound * fine), float(2**23 * fine))
     return None
 
 
@@ -68,9 +68,8 @@ def reach(weights, trend, bias, centres, rails):
     most |f| times the square root of the kernel's fourth, 3 / L^4. Each of the device's kernel values is
     within KERNEL_ERROR of the exact (sg_gp.h).
     """
-    live = np.flatnonzero(np.any([row for _, _, row in rails], axis=0))
-    rows = np.array([row[live] for _, _, row in rails], float)
-    low, high = (np.array([rail[i] for rail in rails], float) for i in (0, 1))
+    live = np.flatnonzero(centres.any(axis=0) | np.any(trend, axis=0))
+    rows, low, high = _slabs(rails, live)
     length = U_STEPS * S_FRAC
     columns = np.linalg.inv(rows) / length
     extent = np.linalg.norm(columns, axis=0) * (high - low)
@@ -91,11 +90,34 @@ def reach(weights, trend, bias, centres, rails):
     )
     worst = 0.0
     for block in np.array_split(middle, max(1, len(middle) // 2000)):
-        k = 65536.0 * np.exp(-0.5 * ((block[:, None] - spot) ** 2).sum(-1))
+        k = 256.0 * np.exp(-0.5 * ((block[:, None] - spot) ** 2).sum(-1))
         for o in range(2):
-            w, slope = weights[:, o].astype(float), trend[o, live].astype(float) * length
-            value = bias[o] + block @ slope + k @ w
+            w, slope = weights[:, o].astype(float), trend[o, live].astype(float) * length / 16
+            value = bias[o] / 16 + block @ slope + k @ w
             gradient = slope + (k * w) @ spot - (k @ w)[:, None] * block
-            spread = np.abs(gradient @ half).sum(axis=1) + 65536.0 * np.sqrt(3.0) / 2 * norm[o] * size2
-            worst = max(worst, np.max(np.abs(value) + spread) + KERNEL_ERROR * np.abs(w).sum())
+            spread = np.abs(gradient @ half).sum(axis=1) + 256.0 * np.sqrt(3.0) / 2 * norm[o] * size2
+            worst = max(worst, np.max(np.abs(value) + spread) + KERNEL_ERROR / 256 * np.abs(w).sum() + 256.0 * len(w))
     return float(worst * (1.0 + 1e-9))
+
+
+def _slabs(rails, live):
+    """Rows [d, d] and their ranges that hold every input in the box and within the guards.
+
+    The guards' directions are completed to all d by axes of the box, most independent first.
+    """
+    d = len(live)
+    rows, low, high = [], [], []
+    for row, least, most in zip(rails.row[:, live].astype(float), rails.low, rails.high):
+        rows.append(row)
+        low.append(256.0 * least)
+        high.append(256.0 * (most + 1))
+    for _ in range(d - len(rows)):
+        free = np.eye(d)
+        if rows:
+            basis = np.linalg.qr(np.array(rows).T)[0]
+            free = free - basis @ basis.T
+        axis = int(np.argmax(np.linalg.norm(free, axis=0)))
+        rows.append(np.eye(d)[axis])
+        low.append(0.0)
+        high.append(float(S_MAX))
+    return np.array(rows[:d]), np.array(low[:d]), np.array(high[:d])

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .errors import ProtocolError, SparsegazeError
+from .trust import sigma_deg
 
 try:
     from ._core import ffi, lib
@@ -269,12 +270,6 @@ def affine(offset_deg, gain=None):
     if steps.shape != (2, 2) or not np.all(np.abs(steps) <= GAIN_STEPS_MAX):
         raise ValueError(f"a recentre gain of {gain} is not inside +-{GAIN_STEPS_MAX / 512:.3f}")
     return Affine(tuple(int(v) for v in offset), tuple(int(v) for v in steps.ravel()))
-
-
-def sigma_deg(code):
-    """sg_gaze.sigma_log2_q4 (a number or an array) -> degrees, float64; NaN for 0, which means unknown."""
-    code = np.asarray(code, float)
-    return np.where(code > 0, 2.0 ** (code / 16.0 - 8.0), np.nan)
 
 
 def _plain(value):

@@ -9,15 +9,13 @@ import numpy as np
 
 from sparsegaze._core import ffi, lib
 
-GUARDS = 8
-U = math.sqrt(4096 / math.log(2))
-_STEP = math.log(2) / 64
-LEVEL = np.array([math.floor(2.0 ** (16 - i / 64) * (1 - _STEP ** 2 / 16)) for i in range(1025)], np.int64)
+U = 64.0
+LEVEL = np.array([min(65535, math.floor(65536 * math.exp(-i / 128))) for i in range(1537)], np.int64)
 
 
 @dataclass
 class Parts:
-    """Everything a model holds, as integers. n vectors, d channels."""
+    """Everything a model holds, as integers. n vectors, d channels, g guards, a grid of [high, wide] nodes."""
     offset: np.ndarray          # [d] feature units
     gain_q12: np.ndarray        # [d]
     bias: np.ndarray            # [2]
@@ -25,41 +23,53 @@ class Parts:
     centre: np.ndarray          # [n, d] 0..255
     weight: np.ndarray          # [n, 2]
     weight_frac_bits: int = 9
-    guard: list = field(default_factory=list)       # (low, high, row [d])
+    guard: list = field(default_factory=list)       # (base, low, high, row [d])
+    expected: np.ndarray = None                     # [high, wide, g]; None: no grid
+    sigma: np.ndarray = None                        # [high, wide]
+    origin: tuple = (-2560, -2560)
+    scale: tuple = (64, 64)
+    limit: int = 65535
+    sigma_gain: int = 0
     generation: int = 1
-    half_c2: np.ndarray = None  # [n]; None: exact
-
-    def __post_init__(self):
-        if self.half_c2 is None:
-            self.half_c2 = 8 * (self.centre.astype(np.int64) ** 2).sum(axis=1)
 
     @property
     def d(self):
         """Channels."""
         return len(self.offset)
 
+    @property
+    def half_c2(self):
+        """[n], as stored: 8 sum c^2 in units of 256, rounded up."""
+        return -(-(self.centre.astype(np.int64) ** 2).sum(axis=1) // 32)
+
     def image(self):
         """The stored model, sealed."""
         n, d = self.centre.shape
-        head = ffi.new("struct sg_model_head *")
-        head.magic, head.version, head.vectors, head.channels = lib.SG_MODEL_MAGIC, 1, n, d
-        head.generation, head.length = self.generation, 256 + 13 * n
-        head.weight_frac_bits, head.guards = self.weight_frac_bits, len(self.guard)
+        head, page = ffi.new("struct sg_model_head *"), ffi.new("struct sg_model_trust *")
+        head.magic, head.version, head.vectors, head.channels = lib.SG_MODEL_MAGIC, 2, n, d
+        grid = b""
+        if self.sigma is not None:
+            page.nodes = [self.sigma.shape[1], self.sigma.shape[0]]
+            for sigma, expected in zip(self.sigma.ravel(), self.expected.reshape(self.sigma.size, len(self.guard))):
+                grid += bytes(int(v) for v in expected) + bytes(4 - len(self.guard)) + bytes([int(sigma)])
+        head.generation, head.length = self.generation, 256 + len(grid) + 12 * n
+        head.weight_frac_bits = self.weight_frac_bits
         head.bias = [int(v) for v in self.bias]
         for j in range(d):
             head.offset[j], head.gain_q12[j] = int(self.offset[j]), int(self.gain_q12[j])
             for i in range(2):
                 head.trend[i][j] = int(self.trend[i][j])
-        page = ffi.new("struct sg_model_guard[8]")
-        for i, (low, high, row) in enumerate(self.guard):
-            page[i].low, page[i].high = int(low), int(high)
+        page.guards, page.limit, page.sigma_gain = len(self.guard), self.limit, self.sigma_gain
+        page.origin_deg_q7, page.scale = list(map(int, self.origin)), list(map(int, self.scale))
+        for i, (base, low, high, row) in enumerate(self.guard):
+            page.guard[i].base, page.guard[i].low, page.guard[i].high = int(base), int(low), int(high)
             for j in range(d):
-                page[i].row[j] = int(row[j])
+                page.guard[i].row[j] = int(row[j])
         records = bytearray()
         for c, half, w in zip(self.centre, self.half_c2, self.weight):
-            records += int(half).to_bytes(3, "little") + bytes(int(v) for v in c) + bytes(6 - d)
+            records += int(half).to_bytes(2, "little") + bytes(int(v) for v in c) + bytes(6 - d)
             records += b"".join(int(v).to_bytes(2, "little", signed=True) for v in w)
-        return seal(bytes(ffi.buffer(head)) + bytes(ffi.buffer(page)) + bytes(records))
+        return seal(bytes(ffi.buffer(head)) + bytes(ffi.buffer(page)) + grid + bytes(records))
 
 
 def seal(image):
@@ -67,14 +77,20 @@ def seal(image):
     return image[:4] + binascii.crc32(image[8:]).to_bytes(4, "little") + image[8:]
 
 
-def random_parts(rng, n, d=6, guards=3, **more):
-    """A model whose every field is drawn over most of its range, but whose features are not all clamped."""
+def random_parts(rng, n, d=6, guards=3, grid=(5, 4), **more):
+    """A model whose every field is drawn over most of its range, but whose features are not all clamped.
+
+    guards 0..4; grid (high, wide), or None."""
     centre = rng.integers(0, 256, (n, d))
     row = [rng.integers(-128, 128, d) for _ in range(guards)]
+    if grid:
+        more.setdefault("expected", rng.integers(0, 256, (*grid, guards)))
+        more.setdefault("sigma", rng.integers(1, 200, grid))
+        more.setdefault("sigma_gain", 3)
     return Parts(offset=rng.integers(0, 40000, d), gain_q12=rng.integers(300, 3000, d),
-                 bias=rng.integers(-2 ** 27, 2 ** 27, 2), trend=rng.integers(-20000, 20000, (2, d)),
+                 bias=rng.integers(-2 ** 22, 2 ** 22, 2), trend=rng.integers(-300, 300, (2, d)),
                  centre=centre, weight=rng.integers(-32768, 32768, (n, 2)),
-                 guard=[(-2 ** 20, 2 ** 20, r) for r in row], **more)
+                 guard=[(-1000, -2 ** 12, 2 ** 12, r) for r in row], **more)
 
 
 def features_near(rng, parts, count):
@@ -92,36 +108,75 @@ def scaled(parts, feature):
     return s, (s != free).any(axis=1)
 
 
+def kernel(parts, s):
+    """k int64 [count, n] at s."""
+    t = (((s * s).sum(axis=1) + 31) >> 5)[:, None] + 256 * parts.half_c2 - s @ parts.centre.T.astype(np.int64)
+    assert (t >= 0).all()
+    level = LEVEL[np.minimum(t >> 9, 1536)]
+    return level - (((level >> 8) * ((t >> 1) & 255)) >> 7)
+
+
 def twin(parts, feature):
-    """The device's answer before it saturates: deg_q7 int64 [count, 2], flagged bool [count]."""
+    """The device's answer: deg_q7 int64 [count, 2] before it saturates, flagged bool [count] by ranges, guards and
+    doubt (not by saturation), doubt [count], sigma [count] as if the angles had not saturated."""
     s, outside = scaled(parts, feature)
-    for low, high, row in parts.guard:
-        projection = s @ np.asarray(row, np.int64)
-        outside |= (projection < low) | (projection > high)
-    s2 = (s * s).sum(axis=1) >> 5
-    t = np.maximum(s2[:, None] + parts.half_c2 - s @ parts.centre.T.astype(np.int64), 0)
-    i = np.minimum(t >> 10, 1023)
-    k = LEVEL[i] - ((((LEVEL[i] - LEVEL[i + 1]) << 6) * (t & 1023)) >> 16)
-    k[t >= 1 << 20] = 0
-    acc = parts.bias + s @ parts.trend.T.astype(np.int64) + k @ parts.weight.astype(np.int64)
-    acc = (acc + 2 ** 31) % 2 ** 32 - 2 ** 31
-    shift = parts.weight_frac_bits + 9
-    return (acc + (1 << (shift - 1))) >> shift, outside
+    acc = (parts.bias + s @ parts.trend.T.astype(np.int64)) >> 4
+    k = kernel(parts, s)
+    for i in range(len(parts.weight)):
+        w = parts.weight[i].astype(np.int64)
+        acc = acc + (k[:, i, None] * w - (k[:, i, None] & 255) * (w & 255)) // 256
+    acc = (acc + 2 ** 23) % 2 ** 24 - 2 ** 23
+    shift = parts.weight_frac_bits + 1
+    deg = (acc + (1 << (shift - 1))) >> shift
+    nodes, total = _corners(parts, np.clip(deg, -32768, 32767))
+    doubt = np.zeros(len(s), np.int64)
+    for i, (base, low, high, row) in enumerate(parts.guard):
+        p = (s @ np.asarray(row, np.int64)) >> 8
+        outside |= (p < low) | (p > high)
+        r = p - base - (total(parts.expected[..., i]) >> 4 if nodes else 0)
+        doubt += np.clip(r, -127, 127) ** 2
+    outside |= doubt > parts.limit
+    sigma = np.zeros(len(s), np.int64)
+    if nodes:
+        sigma = np.minimum(255, (total(parts.sigma) >> 7) + ((doubt * parts.sigma_gain) >> 12))
+    return deg, outside, doubt, np.where(outside & bool(nodes), 255, sigma)
+
+
+def _corners(parts, deg):
+    """(number of nodes, function: node values [high, wide] -> 128 times their blend at deg [count, 2])."""
+    if parts.sigma is None:
+        return 0, None
+    cell, f = [], []
+    for axis in range(2):
+        most = (parts.sigma.shape[1 - axis] - 1) * 65536 - 1
+        t = np.clip((deg[:, axis] - parts.origin[axis]) * parts.scale[axis], 0, most)
+        cell.append(t >> 16)
+        f.append((t >> 9) & 127)
+    w11 = (f[0] * f[1]) >> 7
+    w10, w01 = f[0] - w11, f[1] - w11
+    w00 = 128 - f[0] - w01
+
+    def total(node):
+        x, y = cell
+        return w00 * node[y, x] + w10 * node[y, x + 1] + w01 * node[y + 1, x] + w11 * node[y + 1, x + 1]
+
+    return parts.sigma.size, total
 
 
 def real_mean_deg(parts, feature):
-    """The real-number mean at the same s, degrees [count, 2]; needs exact half_c2."""
+    """The real-number mean at the same s and the same half_c2, degrees [count, 2]."""
     s, _ = scaled(parts, feature)
-    squared = ((s[:, None, :] / 16 - parts.centre[None]) ** 2).sum(axis=2)
-    k = np.exp(-squared / (2 * U * U))
-    unit = 2.0 ** -(parts.weight_frac_bits + 16)
-    return (parts.bias + s @ parts.trend.T) * unit + k @ (parts.weight * 2.0 ** -parts.weight_frac_bits)
+    t = (s * s).sum(axis=1)[:, None] / 32 + 256 * parts.half_c2 - s @ parts.centre.T
+    unit = 2.0 ** -(parts.weight_frac_bits + 12)
+    weight = parts.weight * 2.0 ** -parts.weight_frac_bits
+    return (parts.bias + s @ parts.trend.T) * unit + np.exp(-t / 65536) @ weight
 
 
 def bound_deg(parts):
     """The error bound that sg_gp.h states, degrees [2]."""
     weights = np.abs(parts.weight).sum(axis=0) * 2.0 ** -parts.weight_frac_bits
-    return 2.2 * 2.0 ** -16 * weights + 2.0 ** -8
+    left_out = (parts.weight & 255).sum(axis=0) * 2.0 ** -(parts.weight_frac_bits + 8)
+    return 4.0 * 2.0 ** -16 * weights + left_out + 2.0 ** -(parts.weight_frac_bits + 8) + 2.0 ** -8
 
 
 class View:
@@ -133,12 +188,12 @@ class View:
         self.verdict = lib.sg_model_open(self.view, self.bytes, len(image), 0)
 
     def predict(self, feature):
-        """sg_gp_predict over uint16 [count, 6]: deg_q7 int64 [count, 2], flags [count], results [count]."""
-        deg, flags = ffi.new("int16_t[2]"), ffi.new("uint8_t *")
-        out = np.zeros((len(feature), 2), np.int64)
-        seen = np.zeros(len(feature), np.uint8)
-        results = np.zeros(len(feature), np.int64)
-        for i, row in enumerate(np.ascontiguousarray(feature, np.uint16)):
-            results[i] = lib.sg_gp_predict(self.view, ffi.from_buffer("uint16_t[]", row), deg, flags)
-            out[i], seen[i] = (deg[0], deg[1]), flags[0]
-        return out, seen, results
+        """sg_gp_predict over uint16 [count, 6]: deg_q7 int64 [count, 2], flags [count], results [count], doubt
+        [count], sigma [count]."""
+        point = ffi.new("struct sg_gp_point *")
+        rows = []
+        for row in np.ascontiguousarray(feature, np.uint16):
+            result = lib.sg_gp_predict(self.view, ffi.from_buffer("uint16_t[]", row), point)
+            rows.append((point.deg_q7[0], point.deg_q7[1], point.flags, result, point.doubt, point.sigma_log2_q4))
+        table = np.array(rows, np.int64).reshape(-1, 6)
+        return table[:, :2], table[:, 2], table[:, 3], table[:, 4], table[:, 5]

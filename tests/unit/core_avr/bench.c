@@ -43,7 +43,7 @@ static void infer(const struct sg_model_view *view, uint16_t i, uint8_t section,
     put(gaze, sizeof *gaze);
 }
 
-static uint8_t trial[SG_MODEL_HEAD_BYTES + SG_MODEL_TRIAL_VECTORS_MAX * SG_MODEL_RECORD_BYTES];
+static uint8_t trial[880];
 
 static void predict(struct sg_gaze *gaze)
 {
