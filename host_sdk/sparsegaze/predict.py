@@ -202,8 +202,8 @@ def _on_host(model, features, progress):
     if status < 0:
         raise ModelError(f"the core refuses this model (error {status})", "fit the recording again")
     out = ffi.new("struct sg_gaze[]", max(len(features), 1))
-    lib.sg_batch_infer(view, ffi.from_buffer("uint16_t[]", features), ffi.NULL, ffi.new("struct sg_affine *"), out,
-                       len(features))
+    lib.sg_batch_infer(view, ffi.from_buffer("uint16_t[]", features), ffi.NULL,
+                       ffi.new("struct sg_affine *"), out, len(features))
     return bytes(ffi.buffer(out, len(features) * ffi.sizeof("struct sg_gaze"))), ()
 
 

@@ -1,22 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cycles, stack, flash and RAM of the shipped binary against tests/budget.csv.
+"""Cycles, stack, flash and RAM of the shipped binary against tests/budget.csv."""
 
-A figure above its budget fails, and so does one more than SLACK below it: then the budget is lowered, in
-review, like code.
-"""
-
-import csv
 import subprocess
 
 import numpy as np
 import pytest
 
+from budget import judge_all, read
 from conftest import collect, costly_model, random_features, random_model
 
 from sparsegaze.model import FLAG_OUT_OF_RANGE, kernel_q16, quantise
 
 TARGET = "atmega328p"
-SLACK = 0.05
 FRAME_CYCLES = 61_440
 RAM_BYTES = 2048
 STACK_LEAST_FREE = 100
@@ -26,34 +21,9 @@ SECTIONS = {"infer": "0", "feature": "1", "output": "2", "sense_isr": "3", "seri
 
 
 @pytest.fixture(scope="module")
-def budget(repo_root):
-    """{name: {column: int or None}} of tests/budget.csv for this target."""
-    with open(repo_root / "tests" / "budget.csv", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["target"] == TARGET]
-    columns = ("cycles_max", "stack", "flash", "ram")
-    return {row["name"]: {key: int(row[key]) if row[key] else None for key in columns} for row in rows}
-
-
-def judge(budget, name, column, measured):
-    """None, or what to change."""
-    allowed = budget[name][column]
-    if measured > allowed:
-        return f"{name}: {column} {measured} is above its budget of {allowed}"
-    if measured < allowed * (1 - SLACK):
-        return (f"{name}: {column} {measured} is better than its budget of {allowed}: "
-                f"write {measured} into tests/budget.csv")
-    return None
-
-
-def judge_all(budget, found):
-    assert [text for text in (judge(budget, *item) for item in found) if text] == []
-
-
-def test_a_budget_fails_both_ways():
-    limits = {"x": {"cycles_max": 1000}}
-    assert judge(limits, "x", "cycles_max", 1000) is None and judge(limits, "x", "cycles_max", 950) is None
-    assert "above" in judge(limits, "x", "cycles_max", 1001)
-    assert "write 949" in judge(limits, "x", "cycles_max", 949)
+def budget():
+    """tests/budget.csv for this target."""
+    return read(TARGET)
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ MAIN = """
 #include <string.h>
 #include "case_data.h"
 
-extern uint32_t port_stack[];
+enum {{ CASE_SPACE = 0 }};
 void nothing(void);
 
 static void put(const uint8_t *byte, uint32_t n)
@@ -64,21 +64,20 @@ int main(void)
 }}
 """
 
-# A function of at most four words of arguments, marked round its call; `nothing` tells what that costs.
+# A function marked round its call; `nothing` tells what that costs. The return address waits in a variable,
+# so that arguments on the stack stay where the function looks for them: it must not be recursive.
 WRAP = """
     .syntax unified
     .thumb
+    .bss
+    .align 2
+back: .space 4
     .text
     .global nothing
-    .thumb_func
-nothing:
-    push {{r4, lr}}
-    bl nothing_marked
-    pop {{r4, pc}}
+{marked}
     .thumb_func
 nothing_real:
     bx lr
-{marked}
 """
 MARKED = """
     .global {wrapper}
@@ -88,13 +87,16 @@ MARKED = """
     movs r0, #{section}
     bl scope_begin
     pop {{r0-r4, lr}}
-    push {{r4, lr}}
+    ldr r12, =back
+    str lr, [r12]
     bl {real}
     push {{r0, r1}}
     movs r0, #{section}
     bl scope_end
     pop {{r0, r1}}
-    pop {{r4, pc}}
+    ldr r12, =back
+    ldr pc, [r12]
+    .ltorg
 """
 
 
@@ -155,7 +157,7 @@ def run_cases(directory, body, inputs, out_bytes, includes=(), setup="", data=No
     inputs    array [n, ..] of fixed-width integers: the bytes of a row are what `in` points to
     setup     C statements before the first case: declare what the body needs
     data      {name: bytes}, constant arrays of that name that setup and body may read (8-aligned)
-    wrap      name of a function of the core, called from another file, of at most four words of arguments
+    wrap      name of a function of the core that is called from another file
     """
     directory = pathlib.Path(directory)
     inputs = np.ascontiguousarray(inputs)
@@ -171,7 +173,7 @@ def run_cases(directory, body, inputs, out_bytes, includes=(), setup="", data=No
     (directory / "case_main.c").write_text(MAIN.format(
         includes="\n".join(f'#include "{name}"' for name in includes), out_bytes=out_bytes, setup=setup,
         count=len(padded), body=body, section=SECTION_CASE), encoding="utf-8")
-    marked = [MARKED.format(wrapper="nothing_marked", real="nothing_real", section=SECTION_NOTHING)]
+    marked = [MARKED.format(wrapper="nothing", real="nothing_real", section=SECTION_NOTHING)]
     flags = ["-nostdlib", "-T", PORT / "port.ld", "-Wl,--gc-sections"]
     if wrap:
         marked.append(MARKED.format(wrapper=f"__wrap_{wrap}", real=f"__real_{wrap}",

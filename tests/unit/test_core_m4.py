@@ -11,8 +11,8 @@ from sparsegaze._core import ffi, lib
 from test_core_avr import READINGS, gaze_bytes
 from test_core_gp import GOLDEN_CRC, golden_case
 
-INFER = "sg_track_infer(&view, (const uint16_t *)in, 0, recentre, (struct sg_gaze *)out);"
-OPEN = ("struct sg_model_view view; const int16_t recentre[2] = { 0, 0 };"
+INFER = "sg_track_infer(&view, (const uint16_t *)in, 0, &recentre, (struct sg_gaze *)out);"
+OPEN = ("struct sg_model_view view; const struct sg_affine recentre = { 0 };"
         "if (sg_model_open(&view, image, sizeof image, 0) != SG_OK) return 1;")
 
 

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cycles, stack and flash of the core's functions, per target, against tests/budget.csv.
+
+On the Cortex-M4 the column of the cycles holds instructions, as QEMU counts them: the target's name says so.
+"""
+import pathlib
+
+import numpy as np
+import pytest
+
+import core_avr_cases
+import core_avr_harness as avr
+import core_m4_harness as m4
+from budget import judge, judge_all, read
+from core_footprint import footprint
+from core_models import Parts
+from mlp_models import inputs_near, random_model
+
+AVR, CORTEX_M4 = "atmega328p", "cortex-m4-instructions"
+# The AVR compiler is pinned by requirements.txt; the other is Debian's, whatever it is there.
+M4_COMPILER, OTHER_COMPILER_MARGIN = "12.2", 0.3
+RUN = {AVR: core_avr_cases.run_cases, CORTEX_M4: m4.run_cases}
+
+
+def gp_case():
+    """run_cases' arguments: the costliest ordinary model, 64 vectors, no kernel 0, and 4 guards."""
+    rng = np.random.default_rng(2)
+    parts = Parts(offset=np.full(6, 20000), gain_q12=np.full(6, 1500),
+                  bias=rng.integers(-2 ** 27, 2 ** 27, 2), trend=rng.integers(-9000, 9000, (2, 6)),
+                  centre=rng.integers(98, 103, (64, 6)),
+                  weight=rng.integers(-32768, 32768, (64, 2)),
+                  guard=[(-2 ** 30, 2 ** 30, rng.integers(-128, 128, 6)) for _ in range(4)])
+    feature = (20000 + 1600 * 4096 // 1500 + rng.integers(0, 40, (20, 6))).astype(np.uint16)
+    return {"body": "sg_track_infer(&view, (const uint16_t *)in, 0, &recentre, (struct sg_gaze *)out);",
+            "inputs": feature, "out_bytes": 12, "includes": ["sg_track.h", "sg_err.h"],
+            "setup": "struct sg_model_view view; const struct sg_affine recentre = { { 9, -9 }, { 1, 2, 3, 4 } };"
+                     "if (sg_model_open(&view, image, sizeof image, CASE_SPACE) != SG_OK) return 1;",
+            "data": {"image": parts.image()}}
+
+
+def mlp_case():
+    """A network 6-16-2 of 2-byte weights."""
+    rng = np.random.default_rng(3)
+    model = random_model(rng, 6, (16,), 2, (2, 2))
+    return {"body": "sg_mlp_predict(&view, (const uint16_t *)in, scratch, (int16_t *)out, out + 4);",
+            "inputs": inputs_near(rng, model, 20), "out_bytes": 5, "includes": ["sg_mlp.h", "sg_err.h"],
+            "setup": "struct sg_mlp_view view; static uint16_t scratch[SG_MLP_SCRATCH_MAX];"
+                     "if (sg_mlp_open(&view, image, sizeof image, CASE_SPACE) != SG_OK) return 1;",
+            "data": {"image": model.image}}
+
+
+# function: the case that runs it
+FUNCTIONS = {"sg_track_infer": gp_case, "sg_gp_predict": gp_case, "sg_gp_loop": gp_case,
+             "sg_mlp_predict": mlp_case}
+
+
+def footprint_of(target, elf):
+    """The Footprint of a program that run_cases of the target has made."""
+    if target == AVR:
+        objects, prefix, return_bytes = core_avr_cases.core_objects(), avr.avr_tool("avr-nm")[:-2], 2
+    else:
+        objects, prefix, return_bytes = m4.core_objects(), m4.PREFIX, 0
+    files = [path for made in [*objects, *elf.parent.glob("*.o")] for path in [made.with_suffix(".su")]]
+    return footprint(elf, [path for path in files if path.exists()], prefix, return_bytes)
+
+
+@pytest.mark.parametrize("target", RUN)
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_cycles_stack_and_flash_of_a_function(name, target, tmp_path):
+    result = RUN[target](tmp_path, **FUNCTIONS[name](), wrap=name)
+    taken = footprint_of(target, result.elf)
+    measured = {"cycles_max": int(max(result.function)), "stack": taken.stack(name),
+                "flash": taken.flash[name]}
+    print(f"{name},{target},{measured['cycles_max']},{measured['stack']},{measured['flash']},")
+    pinned = target == AVR or m4.run([m4.tool("gcc"), "-dumpfullversion"]).startswith(M4_COMPILER)
+    judge_all(read(target), [(name, column, value) for column, value in measured.items()],
+              0.0 if pinned else OTHER_COMPILER_MARGIN)
+
+
+def test_every_function_has_a_budget_on_every_target():
+    for target in RUN:
+        assert set(FUNCTIONS) <= {name for name, row in read(target).items() if row["flash"] is not None}
+
+
+def test_a_budget_fails_both_ways():
+    limits = {"x": {"cycles_max": 1000}}
+    assert judge(limits, "x", "cycles_max", 1000) is None and judge(limits, "x", "cycles_max", 950) is None
+    assert "above" in judge(limits, "x", "cycles_max", 1001)
+    assert "write 949" in judge(limits, "x", "cycles_max", 949)
+    assert judge(limits, "x", "cycles_max", 1300, 0.3) is None and judge(limits, "x", "cycles_max", 1301, 0.3)
+
+
+# What remains of a stack that was painted is measured by the program itself, in its last case.
+PAINTED = {
+    AVR: ("extern uint8_t _end; for (uint8_t *p = &_end; p < (uint8_t *)SP - 8; p++) *p = 0xA5;",
+          "{ const uint8_t *p = &_end; while (*p == 0xA5) p++;"
+          " *(uint16_t *)(out + OUT) = (uint16_t)(SP - (uint16_t)p) + 1; }"),
+    CORTEX_M4: ("", "*(uint16_t *)(out + OUT) = 8192 - boot_stack_free();"),
+}
+
+
+@pytest.mark.parametrize("target", RUN)
+@pytest.mark.parametrize("name", ["sg_track_infer", "sg_mlp_predict"])
+def test_the_stack_stated_is_the_stack_seen(name, target, tmp_path):
+    case = FUNCTIONS[name]()
+    place = -(-case["out_bytes"] // 4) * 4
+    paint, look = PAINTED[target]
+    case["setup"] += paint
+    case["body"] += look.replace("OUT", str(place))
+    case["out_bytes"] = place + 4
+    result = RUN[target](tmp_path, **case)
+    seen = int(result.output[-1, place:place + 2].view(np.uint16)[0])
+    taken = footprint_of(target, result.elf)
+    stated = taken.stack(name)
+    if target == CORTEX_M4:
+        seen -= taken.own["main"] + taken.own["boot_reset"]
+    print(f"{name}, {target}: stated {stated}, seen {seen} bytes")
+    assert stated - 16 <= seen <= stated
