@@ -5,6 +5,14 @@
 
 #ifndef SG_MLP_ASSEMBLY
 
+// No branch here depends on data: signs and clamps are masks, so that every input takes the same time.
+
+// All ones if x is not 0, else 0; x below 2^31.
+static inline uint32_t ones_if(uint32_t x)
+{
+    return 0U - ((0U - x) >> 31);
+}
+
 uint8_t sg_mlp_scale(const uint16_t *input, uint16_t *out, const uint8_t *scale, uint8_t n, uint8_t space)
 {
     uint8_t clamped = 0;
@@ -12,43 +20,42 @@ uint8_t sg_mlp_scale(const uint16_t *input, uint16_t *out, const uint8_t *scale,
         const uint16_t x = *input++;
         const uint16_t offset = sg_rom_u16(scale, space);
         const uint16_t gain_q8 = sg_rom_u16(scale + 2, space);
-        const uint8_t below = x < offset ? 255 : 0;
-        const uint16_t difference = below ? 0 : (uint16_t)(x - offset);
-        const uint32_t a = ((uint32_t)difference * gain_q8) >> 8;
-        const uint8_t above = a > 65535UL ? 255 : 0;
-        clamped |= below | above;
-        *out++ = above ? 65535U : (uint16_t)a;
+        const uint32_t difference = (uint32_t)x - offset;
+        const uint32_t below = 0U - (difference >> 31);
+        const uint32_t a = ((uint32_t)(uint16_t)(difference & ~below) * gain_q8) >> 8;
+        const uint32_t above = ones_if(a >> 16);
+        clamped |= (uint8_t)(below | above);
+        *out++ = (uint16_t)(a | above);
     }
     return clamped;
 }
 
-// T of |argument| u8.8 in steps of ln 2 / 32, with the sign.
-static uint16_t squashed(uint32_t q, uint8_t negative)
+// T of an argument u8.8 in steps of ln 2 / 32. negative: all ones, or 0
+static uint16_t squashed(uint32_t q, uint32_t negative)
 {
-    const uint16_t u = q > 65535UL ? 65535U : (uint16_t)q;
+    const uint16_t u = (uint16_t)(q | ones_if(q >> 16));
     const uint16_t *level = &sg_mlp_tanh_table[u >> 8];
     const uint16_t low = sg_rom_word(level);
     const uint16_t rise = (uint16_t)(sg_rom_word(level + 1) - low);
     const uint16_t t = (uint16_t)(low + (uint16_t)(((uint32_t)rise * (u & 255U) + 128U) >> 8));
-    return negative ? (uint16_t)(32768U - t) : (uint16_t)(32768U + t);
+    const uint16_t sign = (uint16_t)negative;
+    return (uint16_t)((uint16_t)((t ^ sign) - sign) + 32768U);
 }
 
 // One row's z, modulo 2^24, to what it leaves behind.
 static uint16_t finished(struct sg_mlp_run *run, uint32_t z, uint16_t scale)
 {
-    const uint8_t negative = (z & 0x800000UL) != 0;
-    const uint32_t magnitude = (negative ? 0U - z : z) & 0xFFFFFFUL;
+    const uint32_t negative = 0U - (uint32_t)((uint8_t)(z >> 16) >> 7);
+    const uint32_t magnitude = ((z ^ negative) - negative) & 0xFFFFFFUL;
     // |z| * scale needs 39 bits; its low byte may go early
     const uint32_t low = (uint32_t)(uint8_t)magnitude * scale + 128U;
     const uint32_t q = (magnitude >> 8) * scale + (low >> 8);
     if (!(run->kind & SG_MLP_OUTPUT))
         return squashed(q, negative);
-    uint32_t y = (q + 128U) >> 8;
-    if (y > 32767U) {
-        y = 32767U;
-        run->saturated = 255;
-    }
-    return (uint16_t)(negative ? 0U - y : y);
+    const uint32_t y = (q + 128U) >> 8;
+    const uint32_t above = ones_if(y & ~32767UL);
+    run->saturated |= (uint8_t)above;
+    return (uint16_t)((((y | above) & 32767U) ^ negative) - negative);
 }
 
 static inline uint32_t biased(const uint8_t *bias, uint32_t correction, uint8_t space)

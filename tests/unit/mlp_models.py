@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stored networks for tests of sg_mlp."""
+import pathlib
+import sys
+
 import numpy as np
 
 from sparsegaze.mlp import HALF, Z_END, Layer, MlpModel
 
+BENCH = pathlib.Path(__file__).resolve().parents[2] / "tools" / "bench"
 TYPICAL_HIDDEN, TYPICAL_OUTPUT = 12000, 256 * 4000      # of q: tanh(1), and 31 degrees
 
 
@@ -43,3 +47,25 @@ def golden_case():
     rng = np.random.default_rng(20260)
     model = random_model(rng, 6, (16, 13, 5), 2, (2, 1, 2, 2))
     return model, inputs_near(rng, model, 64)
+
+
+def expected_bytes(model, features):
+    """What the targets' programs write for each point, by the host's core: outputs, flags, verdict."""
+    *outputs, flags = model.predict(features)
+    y = (np.array(outputs).T * 128).astype("<i2")
+    saturated = np.any(np.abs(y) == 32767, axis=1)
+    verdict = np.where(saturated, 256 - 2, 0).astype(np.uint8)
+    return b"".join(row.tobytes() + bytes([f, v]) for row, f, v in zip(y, flags, verdict))
+
+
+def synthetic_set(seed):
+    """A smooth synthetic set of tools/bench/inference_data.py: features float [289, 6], gaze, held-out
+    features uint16 [2000, 6], their true gaze."""
+    sys.path.insert(0, str(BENCH))
+    try:
+        from inference_data import synthetic
+    finally:
+        sys.path.remove(str(BENCH))
+    made = synthetic("smooth", seed)
+    fitted, held = made.calibration, made.held_out
+    return fitted.features.astype(float), fitted.target_deg, held.features, held.target_deg
