@@ -10,6 +10,7 @@ from sparsegaze import wire
 from sparsegaze.device import Device
 from sparsegaze.mapfile import synthetic_map
 from sparsegaze.model import CHANNELS, SLOT_BYTES, DeviceModel
+from sparsegaze.trust import Trust
 
 FLASH_BYTES = 32768
 SLOT_BASE = (0x6000, 0x6C00)
@@ -21,27 +22,34 @@ def random_model(vectors, seed=0, generation=1, channels=CHANNELS):
     Its inputs span features 30000 .. 40000 about.
     """
     rng = np.random.default_rng(seed)
+    trust = Trust(row=rng.integers(-60, 60, (3, channels)), base=np.full(3, -1000), low=np.full(3, -1024),
+                  high=np.full(3, 1024), expected=rng.integers(0, 256, (3, 3, 3)),
+                  sigma=rng.integers(60, 140, (3, 3)), origin_deg_q7=np.full(2, -2560), scale=np.full(2, 30),
+                  limit=40000, sigma_gain=3)
     return DeviceModel.from_parts(
         offset=rng.integers(30000, 31000, channels), gain_q12=rng.integers(1500, 1700, channels),
-        bias=rng.integers(-2**28, 2**28, 2), trend=rng.integers(-2**15, 2**15, (2, channels)),
+        bias=rng.integers(-2**24, 2**24, 2), trend=rng.integers(-2**10, 2**10, (2, channels)),
         centres=rng.integers(0, 256, (vectors, channels)), weights=rng.integers(-6000, 6000, (vectors, 2)),
-        weight_frac_bits=8, generation=generation,
-        guards=[(-2**18, 2**18, rng.integers(-60, 60, channels)) for _ in range(3)])
+        weight_frac_bits=8, generation=generation, trust=trust)
 
 
 def costly_model(middle, vectors=64, seed=0):
-    """The ordinary model that costs most: six guards, as the distiller writes, and no kernel that ends early.
+    """The ordinary model that costs most: all four guards, a grid of 9 x 9, and no kernel that is 0.
 
     middle    [6] features in the middle of its box; the box is 8190 feature steps wide in every channel
     Its centres lie in the middle fifth of the box, so that no kernel is zero for features within 1000 steps of
     the middle, and every guard passes there, so that all are computed.
     """
     rng = np.random.default_rng(seed)
+    trust = Trust(row=rng.integers(-127, 128, (4, CHANNELS)), base=np.full(4, -1000), low=np.full(4, -2**15),
+                  high=np.full(4, 2**15 - 1), expected=rng.integers(0, 256, (9, 9, 4)),
+                  sigma=rng.integers(60, 140, (9, 9)), origin_deg_q7=np.full(2, -2560), scale=np.full(2, 100),
+                  limit=65535, sigma_gain=3)
     return DeviceModel.from_parts(
         offset=np.asarray(middle, int) - 4095, gain_q12=np.full(CHANNELS, 2048),
-        bias=rng.integers(-2**28, 2**28, 2), trend=rng.integers(-2**15, 2**15, (2, CHANNELS)),
-        centres=rng.integers(102, 154, (vectors, CHANNELS)), weights=rng.integers(-30000, 30000, (vectors, 2)),
-        weight_frac_bits=8, guards=[(-2**30, 2**30, rng.integers(-127, 128, CHANNELS)) for _ in range(CHANNELS)])
+        bias=rng.integers(-2**24, 2**24, 2), trend=rng.integers(-2**10, 2**10, (2, CHANNELS)),
+        centres=rng.integers(102, 154, (vectors, CHANNELS)), weights=rng.integers(-3000, 3000, (vectors, 2)),
+        weight_frac_bits=8, trust=trust)
 
 
 def random_features(n, seed=0):

@@ -23,13 +23,14 @@ RUN = {AVR: core_avr_cases.run_cases, CORTEX_M4: m4.run_cases}
 
 
 def gp_case():
-    """run_cases' arguments: the costliest ordinary model, 64 vectors, no kernel 0, and 4 guards."""
+    """run_cases' arguments: the costliest ordinary model, 64 vectors, no kernel 0, 4 guards and a grid."""
     rng = np.random.default_rng(2)
     parts = Parts(offset=np.full(6, 20000), gain_q12=np.full(6, 1500),
-                  bias=rng.integers(-2 ** 27, 2 ** 27, 2), trend=rng.integers(-9000, 9000, (2, 6)),
+                  bias=rng.integers(-2 ** 22, 2 ** 22, 2), trend=rng.integers(-300, 300, (2, 6)),
                   centre=rng.integers(98, 103, (64, 6)),
                   weight=rng.integers(-32768, 32768, (64, 2)),
-                  guard=[(-2 ** 30, 2 ** 30, rng.integers(-128, 128, 6)) for _ in range(4)])
+                  guard=[(0, -2 ** 15, 2 ** 15 - 1, rng.integers(-128, 128, 6)) for _ in range(4)],
+                  expected=rng.integers(0, 256, (9, 9, 4)), sigma=rng.integers(1, 200, (9, 9)))
     feature = (20000 + 1600 * 4096 // 1500 + rng.integers(0, 40, (20, 6))).astype(np.uint16)
     return {"body": "sg_track_infer(&view, (const uint16_t *)in, 0, &recentre, (struct sg_gaze *)out);",
             "inputs": feature, "out_bytes": 12, "includes": ["sg_track.h", "sg_err.h"],
