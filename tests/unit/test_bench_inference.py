@@ -233,6 +233,12 @@ def test_of_models_within_a_budget_the_nearest_counts(bench):
     assert bench.judge.within(rows, 3999) is None
 
 
+def test_the_fewest_vectors_that_are_as_good_as_the_process_are_named(bench):
+    sizes = ((8, 0.60), (32, 0.52), (64, 0.50))
+    rows = [frontier_row(n=n, truth=t) for n, t in sizes] + [frontier_row("sim-1", n=8, truth=0.6)]
+    assert bench.judge.smallest(rows) == {"sim-0": 32, "sim-1": None}
+
+
 def test_a_peer_is_dominated_only_by_what_is_faster_and_no_worse(bench):
     ours = [frontier_row(n=16, cycles=5000, truth=0.60), frontier_row(n=64, cycles=15_000, truth=0.50)]
     none = {"name": "p", "version": "1", "dataset": "sim-0", "fits": True}

@@ -9,7 +9,7 @@ beside them with `all_` before their names. Truth is where the simulated eye rea
 import numpy as np
 
 from sparsegaze import metrics
-from sparsegaze.wire import lib
+from sparsegaze.predict import predict
 
 CYCLES_BAR, CYCLES_AIM = 11_000, 7_000
 RATIO_BAR, RMS_BAR_DEG, RMS_AIM_DEG, SMOOTH_BAR_DEG = 1.05, 0.15, 0.05, 0.02
@@ -51,14 +51,18 @@ def judge(data, model, gp_deg, shared):
     Returns a dict: errors() of judged rows and of all valid ones, shared_truth_mean_deg, share_flagged (of
     the valid rows), rows.
     """
-    answer = model.predict(data.held_out.features)
-    device = np.column_stack(answer[:2])
-    passed = (answer[2] & lib.SG_FLAG_VALID) != 0
+    device, passed, _ = answers(data, model)
     valid, true = data.held_out.valid, data.truth["held_out_gaze_deg"]
     figures = errors(device, gp_deg, true, valid & passed)
     figures.update(errors(device, gp_deg, true, valid, "all_"))
     figures["shared_truth_mean_deg"] = float(distances_deg(device[shared], true[shared]).mean())
     return {**figures, "share_flagged": float(np.mean(~passed[valid])), "rows": int(valid.sum())}
+
+
+def answers(data, model):
+    """At held-out rows by the device's code: gaze [n, 2] deg, not flagged bool [n], sigma [n] deg or nan."""
+    made = predict(model, data.held_out.features)
+    return np.column_stack([made.azimuth_deg, made.elevation_deg]), made.valid, made.sigma_deg
 
 
 def shared_rows(data, most=SHARED_ROWS):
@@ -87,20 +91,19 @@ def judge_variance(data, model, gp_deg, gp_std, noise_deg):
     targets, its noise in sigma, which is what it promises. Of all settled frames: shut, half, narrow _frames
     and _flagged by the lids' opening, blink_flagged, the error of blinks not flagged, false_alarms (open).
     """
-    answer = model.predict(data.held_out.features)
-    passed = (answer[2] & lib.SG_FLAG_VALID) != 0
+    device, passed, sigma = answers(data, model)
     truth = data.truth
     lids, settled, true = truth["held_out_lid_opening"], truth["held_out_settled"], truth["held_out_gaze_deg"]
     rows = data.held_out.valid & passed & (lids >= OPEN)
     figures = {"coverage68": None, "coverage95": None, "sharpness_deg": None, "error_rms_deg": None}
-    if len(answer) > 3 and np.isfinite(answer[3][rows]).all():
-        error = np.column_stack(answer[:2])[rows] - true[rows]
-        figures = coverage(error, answer[3][rows])
-        figures["sorted_error_ratio"] = sorted_error_ratio(np.hypot(*error.T), answer[3][rows])
+    if np.isfinite(sigma[rows]).all():
+        error = (device - true)[rows]
+        figures = coverage(error, sigma[rows])
+        figures["sorted_error_ratio"] = sorted_error_ratio(np.hypot(*error.T), sigma[rows])
     whole = np.hypot(gp_std, noise_deg)
     target = data.held_out.target_deg
-    for name, against, sigma in (("gp64_", true, gp_std), ("gp64_target_", target, whole)):
-        known = coverage((gp_deg - against)[rows], sigma[rows])
+    for name, against, own in (("gp64_", true, gp_std), ("gp64_target_", target, whole)):
+        known = coverage((gp_deg - against)[rows], own[rows])
         figures.update({name + key: value for key, value in known.items()})
     for name, low, high in (("shut", -1.0, 0.3), ("half", 0.3, 0.7), ("narrow", 0.7, BLINK)):
         here = settled & (lids >= low) & (lids < high)
@@ -108,7 +111,7 @@ def judge_variance(data, model, gp_deg, gp_std, noise_deg):
         figures[f"{name}_flagged"] = float(np.mean(~passed[here])) if here.any() else None
     blink, clear = settled & (lids < BLINK), settled & (lids >= OPEN)
     missed = blink & passed
-    apart = distances_deg(np.column_stack(answer[:2]), true)
+    apart = distances_deg(device, true)
     figures["blink_flagged"] = float(np.mean(~passed[blink])) if blink.any() else None
     figures["blink_missed_error_deg"] = float(apart[missed].mean()) if missed.any() else None
     figures["false_alarms"] = float(np.mean(~passed[clear]))
@@ -140,6 +143,15 @@ def worst(frontier, kind, cycles, figure):
     """Largest figure(row) over data sets of a kind, each by its best row in a budget; None without one."""
     chosen = [within(rows, cycles) for rows in by_dataset(frontier, kind).values()]
     return max(map(figure, chosen)) if chosen and None not in chosen else None
+
+
+def smallest(frontier):
+    """{dataset: fewest vectors whose truth error is at most RATIO_BAR times the process's; None if none is}."""
+    good = {row["dataset"]: None for row in frontier}
+    for row in sorted(frontier, key=lambda one: -one["n"]):
+        if row["truth_mean_deg"] is not None and ratio(row) <= RATIO_BAR:
+            good[row["dataset"]] = row["n"]
+    return good
 
 
 def ratio(row):
