@@ -146,7 +146,7 @@ def worst(frontier, kind, cycles, figure):
 
 
 def smallest(frontier):
-    """{dataset: fewest vectors whose truth error is at most RATIO_BAR times the process's; None if none is}."""
+    """{dataset: fewest vectors whose truth error is within RATIO_BAR of the process's; None if none is}."""
     good = {row["dataset"]: None for row in frontier}
     for row in sorted(frontier, key=lambda one: -one["n"]):
         if row["truth_mean_deg"] is not None and ratio(row) <= RATIO_BAR:
