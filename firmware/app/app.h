@@ -37,6 +37,36 @@ struct app_state {
 };
 extern struct app_state app;
 
+// A frame's streams; the counts take the place of the features once those are sent.
+struct app_streams {
+    union {
+        struct sg_raw raw;
+        struct sg_counts counts;
+    };
+    struct sg_gaze gaze;
+};
+
+// Of a request and then its answer, or of a frame's streams, in one place: RAM is short, an answer is made when
+// its request is read, and a frame begins and ends between requests. One instance, in app_requests.c.
+union app_body {
+    struct sg_hello hello;
+    struct sg_status status;
+    struct sg_ping ping;
+    struct sg_pong pong;
+    struct sg_mode mode;
+    struct sg_infer infer;
+    struct sg_gaze gaze;
+    struct sg_model_info info;
+    struct sg_model_at at;
+    struct sg_model_data data;
+    struct sg_model_verdict verdict;
+    struct sg_exposure exposure;
+    struct sg_recentre recentre;
+    struct app_streams streams;
+    uint8_t bytes[SG_WIRE_BODY_MAX];
+};
+extern union app_body app_body;
+
 // main.c
 void app_count(uint16_t *counter);                          // up to 65535
 uint16_t app_exposure_limit(uint16_t exposure_cycles);      // into the board's limits
@@ -60,8 +90,8 @@ void app_models_step(void);                                 // one piece of a ch
 void app_live_start(void);                                  // load, count the boot
 uint16_t app_live_boots(void);
 void app_live_exposures(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t *automatic);     // as stored
-const struct sg_affine *app_recentre(void);                 // in force for the model in use
-void app_recentre_set(const struct sg_affine *affine);
+const struct sg_affine *app_recentre(void);                 // in force for the model in use; NULL: none
+void app_recentre_set(const struct sg_affine *affine);      // NULL: none
 void app_live_keep_exposures(void);                         // store them as they are now
 void app_live_frame(void);                                  // once per frame: notice exposures that moved
 void app_live_step(void);

@@ -73,19 +73,19 @@ void app_live_exposures(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t *automat
     *automatic = live.exposure_auto != 0;
 }
 
-static const struct sg_affine none;
-
 const struct sg_affine *app_recentre(void)
 {
     const struct sg_model_view *model = app_model();
-    return model && model->crc == live.model_crc ? &live.recentre : &none;
+    return model && model->crc == live.model_crc ? &live.recentre : NULL;
 }
 
 void app_recentre_set(const struct sg_affine *affine)
 {
     const struct sg_model_view *model = app_model();
     live.model_crc = model ? model->crc : 0;
-    live.recentre = affine ? *affine : none;
+    memset(&live.recentre, 0, sizeof live.recentre);
+    if (affine)
+        live.recentre = *affine;
     dirty = 1;
 }
 

@@ -167,10 +167,8 @@ int8_t app_trial_write(const struct sg_model_data *data)
     return SG_OK;
 }
 
-void app_models_step(void)
+NOT_KEPT static void check_on(void)
 {
-    if (!check.at)
-        return;
     const uint8_t *image = slot_image(check.slot);
     const uint8_t space = slot_space(check.slot);
     if (check.at < check.length) {
@@ -190,4 +188,10 @@ void app_models_step(void)
         verdict[SG_SLOT_RAM] = result;
     }
     answer(result);
+}
+
+void app_models_step(void)
+{
+    if (check.at)
+        check_on();
 }

@@ -8,25 +8,7 @@
 
 enum { REBOOT_KEY = 0xA5, STREAM_ALL = SG_STREAM_RAW | SG_STREAM_GAZE | SG_STREAM_COUNTS };
 
-// Of a request and of its answer, in one place: RAM is short, and an answer is made when its request is read.
-union body {
-    struct sg_hello hello;
-    struct sg_status status;
-    struct sg_ping ping;
-    struct sg_pong pong;
-    struct sg_mode mode;
-    struct sg_infer infer;
-    struct sg_gaze gaze;
-    struct sg_model_info info;
-    struct sg_model_at at;
-    struct sg_model_data data;
-    struct sg_model_verdict verdict;
-    struct sg_exposure exposure;
-    struct sg_recentre recentre;
-    uint8_t bytes[SG_WIRE_BODY_MAX];
-};
-
-static union body body;
+union app_body app_body;
 
 static void refuse(uint8_t type, uint16_t seq, int8_t error)
 {
@@ -130,37 +112,39 @@ static int8_t recentre(struct sg_recentre *io)
         app_recentre_set(&io->affine);
     else if (io->op == SG_RECENTRE_CLEAR)
         app_recentre_set(NULL);
-    io->affine = *app_recentre();
+    const struct sg_affine *now = app_recentre();
+    memset(&io->affine, 0, sizeof io->affine);
+    if (now)
+        io->affine = *now;
     io->reserved = 0;
     return SG_OK;
 }
 
-static void infer(void)
+static void infer(uint16_t seq)
 {
-    uint16_t feature[HAL_CHANNELS];
-    memcpy(feature, body.infer.feature, sizeof feature);
     const uint8_t flags = app_model_slot() == SG_SLOT_RAM ? SG_FLAG_TRIAL : 0;
     const struct sg_model_view *model = app_model();
     const struct sg_affine *recentre = app_recentre();
     HAL_BEGIN(HAL_SECTION_REQUEST);
-    sg_track_infer(model, feature, flags, recentre, &body.gaze);
+    sg_track_infer(model, app_body.infer.feature, flags, recentre, &app_body.gaze);
     HAL_END(HAL_SECTION_REQUEST);
+    app_send(SG_MSG_INFER | SG_REPLY, seq, &app_body.gaze, sizeof app_body.gaze, 0);
 }
 
 static int8_t trial_write(uint8_t n)
 {
-    if (body.data.length > n - offsetof(struct sg_model_data, data))
+    if (app_body.data.length > n - offsetof(struct sg_model_data, data))
         return SG_E_SHORT;
-    const int8_t result = app_trial_write(&body.data);
+    const int8_t result = app_trial_write(&app_body.data);
     // The answer's fields are the request's, in another order.
-    const struct sg_model_at at = { .offset = body.data.offset, .slot = body.data.slot,
-                                    .length = body.data.length };
-    body.at = at;
+    const struct sg_model_at at = { .offset = app_body.data.offset, .slot = app_body.data.slot,
+                                    .length = app_body.data.length };
+    app_body.at = at;
     return result;
 }
 
 // `body` holds the n bytes of the request, and then its answer.
-static void request(const struct sg_head *head, uint8_t n, uint32_t arrived_us)
+NOT_KEPT static void request(const struct sg_head *head, uint8_t n, uint32_t arrived_us)
 {
     uint8_t answer_bytes = 0;
     int8_t result = SG_OK;
@@ -173,73 +157,69 @@ static void request(const struct sg_head *head, uint8_t n, uint32_t arrived_us)
     }
     switch (head->type) {
     case SG_MSG_HELLO:
-        app_describe(&body.hello);
-        answer_bytes = sizeof body.hello;
+        app_describe(&app_body.hello);
+        answer_bytes = sizeof app_body.hello;
         break;
     case SG_MSG_STATUS:
-        status(&body.status);
-        answer_bytes = sizeof body.status;
+        status(&app_body.status);
+        answer_bytes = sizeof app_body.status;
         break;
     case SG_MSG_PING:
-        body.pong.rx_us = arrived_us;
-        body.pong.tx_us = hal_now_us();
-        answer_bytes = sizeof body.pong;
+        app_body.pong.rx_us = arrived_us;
+        app_body.pong.tx_us = hal_now_us();
+        answer_bytes = sizeof app_body.pong;
         break;
     case SG_MSG_MODE:
-        if (body.mode.mode & ~STREAM_ALL)
+        if (app_body.mode.mode & ~STREAM_ALL)
             result = SG_E_ARG;
         else
-            app.stream = body.mode.mode;
-        answer_bytes = sizeof body.mode;
-        break;
-    case SG_MSG_INFER:
-        infer();
-        answer_bytes = sizeof body.gaze;
+            app.stream = app_body.mode.mode;
+        answer_bytes = sizeof app_body.mode;
         break;
     case SG_MSG_MODEL_INFO:
-        app_model_info(&body.info);
-        answer_bytes = sizeof body.info;
+        app_model_info(&app_body.info);
+        answer_bytes = sizeof app_body.info;
         break;
     case SG_MSG_MODEL_READ: {
-        const struct sg_model_at at = body.at;
-        result = app_model_read(&at, &body.data);
+        const struct sg_model_at at = app_body.at;
+        result = app_model_read(&at, &app_body.data);
         answer_bytes = offsetof(struct sg_model_data, data) + at.length;
         break;
     }
     case SG_MSG_MODEL_VERIFY:
-        result = app_model_verify(body.at.slot, head->seq);
+        result = app_model_verify(app_body.at.slot, head->seq);
         answered = 1;
         break;
     case SG_MSG_TRIAL_WRITE:
         result = trial_write(n);
-        answer_bytes = sizeof body.at;
+        answer_bytes = sizeof app_body.at;
         break;
     case SG_MSG_TRIAL_USE:
-        if (body.mode.mode > 1)
+        if (app_body.mode.mode > 1)
             result = SG_E_ARG;
-        else if (body.mode.mode == 1) {
+        else if (app_body.mode.mode == 1) {
             result = app_trial_use(head->seq);
             answered = 1;
         } else {
-            result = app_trial_leave(&body.verdict);
-            answer_bytes = sizeof body.verdict;
+            result = app_trial_leave(&app_body.verdict);
+            answer_bytes = sizeof app_body.verdict;
         }
         break;
     case SG_MSG_EXPOSURE:
-        result = exposure(&body.exposure);
-        answer_bytes = sizeof body.exposure;
+        result = exposure(&app_body.exposure);
+        answer_bytes = sizeof app_body.exposure;
         break;
     case SG_MSG_RECENTRE:
-        result = recentre(&body.recentre);
-        answer_bytes = sizeof body.recentre;
+        result = recentre(&app_body.recentre);
+        answer_bytes = sizeof app_body.recentre;
         break;
     case SG_MSG_REBOOT:
-        result = body.mode.mode == REBOOT_KEY ? SG_OK : SG_E_ARG;
-        answer_bytes = sizeof body.mode;
+        result = app_body.mode.mode == REBOOT_KEY ? SG_OK : SG_E_ARG;
+        answer_bytes = sizeof app_body.mode;
         break;
     case SG_MSG_BAUD:
-        result = body.mode.mode <= 1 ? SG_OK : SG_E_ARG;
-        answer_bytes = sizeof body.mode;
+        result = app_body.mode.mode <= 1 ? SG_OK : SG_E_ARG;
+        answer_bytes = sizeof app_body.mode;
         break;
     }
 
@@ -249,23 +229,20 @@ static void request(const struct sg_head *head, uint8_t n, uint32_t arrived_us)
     }
     if (answered)
         return;
-    app_send(head->type | SG_REPLY, head->seq, body.bytes, answer_bytes, 0);
+    app_send(head->type | SG_REPLY, head->seq, app_body.bytes, answer_bytes, 0);
     if (head->type == SG_MSG_REBOOT)
         hal_after_sending(HAL_AFTER_REBOOT);
     if (head->type == SG_MSG_BAUD)
-        hal_after_sending(body.mode.mode ? HAL_AFTER_BAUD_500K : HAL_AFTER_BAUD_1M);
-}
-
-// Of its own for the decoder's copy of the packet.
-NOT_KEPT static int receive(uint8_t byte, struct sg_head *head)
-{
-    return sg_link_receive(&app.link, byte, head, body.bytes);
+        hal_after_sending(app_body.mode.mode ? HAL_AFTER_BAUD_500K : HAL_AFTER_BAUD_1M);
 }
 
 void app_on_byte(uint8_t byte, uint32_t zero_us)
 {
     struct sg_head head;
-    const int n = receive(byte, &head);
-    if (n >= 0)
+    const int n = sg_link_receive(&app.link, byte, &head, app_body.bytes);
+    // Inference goes deepest: not from inside of request().
+    if (n >= (int)sizeof app_body.infer && head.type == SG_MSG_INFER)
+        infer(head.seq);
+    else if (n >= 0)
         request(&head, (uint8_t)n, zero_us);
 }

@@ -49,9 +49,9 @@ uint32_t hal_now_us(void);
 // Exposures from the next slots on, clipped to the port's limits. Whole: no slot sees half of an exposure.
 void hal_expose(const uint16_t exposure_cycles[HAL_CHANNELS]);
 
-// Queue n bytes whole if at least keep_free bytes of the queue stay free after them. Returns 1, or 0 if not
-// queued.
-uint8_t hal_send(const uint8_t *bytes, uint8_t n, uint8_t keep_free);
+// Encode a packet (sg_wire_encode_ring: n + 8 bytes) into the send queue if at least keep_free bytes of the
+// queue stay free after it. n <= SG_WIRE_BODY_MAX. Returns 1, or 0 if not queued.
+uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_t keep_free);
 
 // Once everything queued has left: change the line speed, or reset through the watchdog (slow writes are
 // finished first). Until then hal_send() refuses.

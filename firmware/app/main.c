@@ -3,6 +3,8 @@
 // nothing of the chip.
 #include "app.h"
 
+#include <string.h>
+
 enum {
     // Stream frames leave this much of the send queue to answers.
     REPLY_RESERVE = SG_WIRE_FRAME_MAX,
@@ -32,9 +34,7 @@ uint16_t app_exposure_limit(uint16_t exposure_cycles)
 uint8_t app_send(uint8_t type, uint16_t seq, const void *body, uint8_t n, uint8_t keep_free)
 {
     const struct sg_head head = { .seq = seq, .type = type, .flags = 0 };
-    uint8_t bytes[SG_WIRE_FRAME_MAX];
-    const int length = sg_wire_encode(&head, body, n, bytes);
-    return length > 0 && hal_send(bytes, (uint8_t)length, keep_free);
+    return hal_send(&head, body, n, keep_free);
 }
 
 static void send_stream(uint8_t type, uint16_t seq, const void *body, uint8_t n)
@@ -83,17 +83,11 @@ static void count_readings(const struct hal_frame *frame)
     }
 }
 
-// What is streamed besides the gaze, one after the other in one place: RAM is short.
-union streamed {
-    struct sg_raw raw;
-    struct sg_counts counts;
-};
-
-static void stream(const struct hal_frame *frame, union streamed *out, const struct sg_gaze *gaze)
+static void stream(const struct hal_frame *frame, struct app_streams *out)
 {
     // The gaze goes first: it is the one that somebody waits for.
     if (app.stream & SG_STREAM_GAZE)
-        send_stream(SG_MSG_GAZE, frame->seq, gaze, sizeof *gaze);
+        send_stream(SG_MSG_GAZE, frame->seq, &out->gaze, sizeof out->gaze);
     if (app.stream & SG_STREAM_RAW)
         send_stream(SG_MSG_RAW, frame->seq, &out->raw, sizeof out->raw);
     if (app.stream & SG_STREAM_COUNTS) {
@@ -110,11 +104,10 @@ void app_on_frame(const struct hal_frame *frame)
 {
     const struct sg_model_view *model = app_model();
     const struct sg_affine *recentre = app_recentre();
-    union streamed out = { .raw = { .t_us = frame->t_us, .span_us = frame->span_us } };
-    struct sg_gaze gaze;
+    struct app_streams *out = &app_body.streams;
 
     HAL_BEGIN(HAL_SECTION_FEATURE);
-    uint8_t flags = sg_track_features(frame->code_q2, frame->exposure_cycles, out.raw.feature);
+    uint8_t flags = sg_track_features(frame->code_q2, frame->exposure_cycles, out->raw.feature);
     HAL_END(HAL_SECTION_FEATURE);
     flags |= exposures_changed(frame);
     if (app_model_slot() == SG_SLOT_RAM)
@@ -123,20 +116,25 @@ void app_on_frame(const struct hal_frame *frame)
         flags |= SG_FLAG_RECOVERING;
         recovery--;
     }
-    out.raw.flags = flags;
-    out.raw.model_crc = model ? model->crc : 0;
-    out.raw.recentre = *recentre;
+    out->raw.flags = flags;
+    out->raw.model_crc = model ? model->crc : 0;
+    out->raw.t_us = frame->t_us;
+    out->raw.span_us = frame->span_us;
+    out->raw.reserved = 0;
+    memset(&out->raw.recentre, 0, sizeof out->raw.recentre);
+    if (recentre)
+        out->raw.recentre = *recentre;
 
     HAL_BEGIN(HAL_SECTION_INFER);
-    sg_track_infer(model, out.raw.feature, flags, recentre, &gaze);
+    sg_track_infer(model, out->raw.feature, flags, recentre, &out->gaze);
     HAL_END(HAL_SECTION_INFER);
-    if (gaze.flags & SG_FLAG_OUT_OF_RANGE)
+    if (out->gaze.flags & SG_FLAG_OUT_OF_RANGE)
         recovery = RECOVERY_FRAMES;
-    gaze.t_us = frame->t_us;
-    gaze.infer_us = (uint16_t)(hal_now_us() - (frame->t_us + frame->span_us));
+    out->gaze.t_us = frame->t_us;
+    out->gaze.infer_us = (uint16_t)(hal_now_us() - (frame->t_us + frame->span_us));
 
     HAL_BEGIN(HAL_SECTION_OUTPUT);
-    stream(frame, &out, &gaze);
+    stream(frame, out);
     HAL_END(HAL_SECTION_OUTPUT);
 
     if (flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED))

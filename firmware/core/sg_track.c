@@ -65,7 +65,7 @@ int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], 
         result = sg_gp_predict(view, feature, &point);
         deg_q7[0] = point.deg_q7[0];
         deg_q7[1] = point.deg_q7[1];
-        if (!correct(recentre, deg_q7))
+        if (recentre != NULL && !correct(recentre, deg_q7))
             result = SG_E_RANGE;
         flags |= result == SG_OK ? point.flags : (uint8_t)SG_FLAG_OUT_OF_RANGE;
         sigma_log2_q4 = result == SG_OK ? point.sigma_log2_q4 : (uint8_t)SG_GP_SIGMA_HUGE;

@@ -19,20 +19,48 @@ uint16_t sg_wire_crc16(uint16_t crc, const uint8_t *data, size_t n)
     return crc;
 }
 
-// A COBS group under construction: out[code] waits for its length.
-struct cobs_writer {
-    uint8_t *out;
-    uint8_t code;
-    uint8_t at;
-};
-
-static void cobs_put(struct cobs_writer *w, uint8_t byte)
+uint16_t sg_wire_encode_ring(const struct sg_head *head, const void *body, uint8_t body_bytes, uint8_t *ring,
+                             uint16_t size, uint16_t at)
 {
-    if (byte == 0) {
-        w->out[w->code] = (uint8_t)(w->at - w->code);
-        w->code = w->at++;
-    } else {
-        w->out[w->at++] = byte;
+    // A packet has at most 70 bytes, so no group reaches the 254 bytes at which COBS needs a second rule.
+    const uint8_t head_byte[SG_WIRE_HEAD_BYTES] = {
+        (uint8_t)head->seq, (uint8_t)(head->seq >> 8), head->type, head->flags,
+    };
+    const uint8_t *from = head_byte;
+    uint8_t left = SG_WIRE_HEAD_BYTES, part = 0;    // head, body, CRC
+    uint8_t tail[2];
+    uint16_t crc = 0xFFFF;
+    uint8_t *out = ring + at, *code = out;          // where the length of the group under way will stand
+    uint8_t group = 0, byte = 0;
+    for (;;) {
+        // A zero, and the frame's first byte, hold the place of the next group's length.
+        if (byte == 0) {
+            *code = group;
+            code = out;
+            group = 0;
+        }
+        group++;
+        *out++ = byte;
+        if (out == ring + size)
+            out = ring;
+        while (left == 0) {
+            if (++part == 1) {
+                from = body;
+                left = body_bytes;
+            } else if (part == 2) {
+                tail[0] = (uint8_t)crc;
+                tail[1] = (uint8_t)(crc >> 8);
+                from = tail;
+                left = sizeof tail;
+            } else {
+                *code = group;
+                *out++ = 0;
+                return (uint16_t)((out == ring + size ? ring : out) - ring);
+            }
+        }
+        byte = *from++;
+        left--;
+        crc = crc16_byte(crc, byte);
     }
 }
 
@@ -40,31 +68,12 @@ int sg_wire_encode(const struct sg_head *head, const void *body, size_t body_byt
 {
     if (body_bytes > SG_WIRE_BODY_MAX)
         return SG_E_BOUNDS;
-    // A packet has at most 70 bytes, so no group reaches the 254 bytes at which COBS needs a second rule.
-    struct cobs_writer w = { .out = out, .code = 0, .at = 1 };
-    const uint8_t *body_byte = body;
-    const uint8_t head_byte[SG_WIRE_HEAD_BYTES] = {
-        (uint8_t)head->seq, (uint8_t)(head->seq >> 8), head->type, head->flags,
-    };
-    uint16_t crc = 0xFFFF;
-    for (uint8_t i = 0; i < SG_WIRE_HEAD_BYTES; i++) {
-        crc = crc16_byte(crc, head_byte[i]);
-        cobs_put(&w, head_byte[i]);
-    }
-    for (uint8_t i = 0; i < (uint8_t)body_bytes; i++) {
-        crc = crc16_byte(crc, body_byte[i]);
-        cobs_put(&w, body_byte[i]);
-    }
-    cobs_put(&w, (uint8_t)crc);
-    cobs_put(&w, (uint8_t)(crc >> 8));
-    out[w.code] = (uint8_t)(w.at - w.code);
-    out[w.at++] = 0;
-    return w.at;
+    return sg_wire_encode_ring(head, body, (uint8_t)body_bytes, out, SG_WIRE_FRAME_MAX + 1, 0);
 }
 
-int sg_wire_decode(const uint8_t *frame, size_t n, struct sg_head *head, void *body)
+int sg_wire_decode(uint8_t *frame, size_t n, struct sg_head *head, void *body)
 {
-    uint8_t packet[SG_WIRE_PACKET_MAX];
+    uint8_t *packet = frame;    // never gets ahead: a group has one byte more than what it stands for
     uint8_t fill = 0;
     size_t at = 0;
     while (at < n) {

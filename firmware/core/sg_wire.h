@@ -213,9 +213,15 @@ uint16_t sg_wire_crc16(uint16_t crc, const uint8_t *data, size_t n);
 // Returns the number of bytes written, delimiter included, or SG_E_BOUNDS.
 int sg_wire_encode(const struct sg_head *head, const void *body, size_t body_bytes, uint8_t *out);
 
+// The same into a ring of `size` bytes, from index `at` on, body_bytes + 8 bytes in all, which must be free.
+// body_bytes <= SG_WIRE_BODY_MAX. Returns the index behind the delimiter.
+uint16_t sg_wire_encode_ring(const struct sg_head *head, const void *body, uint8_t body_bytes, uint8_t *ring,
+                             uint16_t size, uint16_t at);
+
 // Decode one frame, given without its delimiter. body must hold SG_WIRE_BODY_MAX bytes.
+// The frame is used up: its bytes become the packet's.
 // Returns the body's length, or SG_E_SHORT, SG_E_BOUNDS, SG_E_CRC. Never reads or writes out of bounds, whatever comes.
-int sg_wire_decode(const uint8_t *frame, size_t n, struct sg_head *head, void *body);
+int sg_wire_decode(uint8_t *frame, size_t n, struct sg_head *head, void *body);
 // cdef end
 
 _Static_assert(sizeof(struct sg_head) == SG_WIRE_HEAD_BYTES, "wire layout");

@@ -45,13 +45,12 @@ void app_on_byte(uint8_t byte, uint32_t zero_us)
 {
     struct sg_status status;
     struct sg_head head = { .seq = 1, .type = SG_MSG_STATUS | SG_REPLY, .flags = 0 };
-    uint8_t out[SG_WIRE_FRAME_MAX];
     (void)zero_us;
     if (byte != 0)
         return;
     memset(&status, 0, sizeof status);
     hal_report(&status);
-    hal_send(out, (uint8_t)sg_wire_encode(&head, &status, sizeof status, out), 0);
+    hal_send(&head, &status, sizeof status, 0);
 }
 
 int main(void)

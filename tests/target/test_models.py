@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Models on the device: bit identity with the host's core, the store, the RAM trial, the recentre offset."""
 
+import binascii
+import struct
 import zlib
 
 import numpy as np
 import pytest
 
 from conftest import collect, exchange, random_features, random_model
-from sparsegaze import wire
+from sparsegaze import replay, wire
 from sparsegaze.errors import DeviceError
 from sparsegaze.model import DeviceModel
 from sparsegaze.wire import lib
@@ -23,10 +25,11 @@ def flat_model():
         centres=np.full((1, 6), 128), weights=np.zeros((1, 2), int), weight_frac_bits=8, generation=1, guards=[])
 
 
-def host_gaze(model, features, recentre_deg=(0.0, 0.0)):
+def host_gaze(model, features, recentre_deg=(0.0, 0.0), gain=None):
     """[n, 3] integers azimuth, elevation (1/128 deg) and flags, as the host's core computes them."""
-    az_deg, el_deg, flags = model.predict(features, recentre_deg)
-    return np.stack([np.asarray(az_deg) * 128, np.asarray(el_deg) * 128, flags], 1).astype(np.int32)
+    affine = np.array(tuple(wire.affine(recentre_deg, gain)), replay.AFFINE)
+    gazes = replay.infer(model, features, recentre=affine)
+    return np.column_stack([gazes.q7, gazes.flags]).astype(np.int32)
 
 
 def device_gaze(device, features):
@@ -52,7 +55,7 @@ def test_infer_is_bit_identical_to_the_host_core(board):
 def test_streamed_gaze_is_what_the_host_computes_from_the_raw_frame(board):
     model = random_model(64)
     nano, device = board(models={0: model.image})
-    device.recentre((1.5, -2.25))
+    device.recentre((1.5, -2.25), [[0.125, -0.05], [0.02, -0.248]])
     device.set_stream(raw=True, gaze=True)
     frames = collect(device, 20)
     device.exposure(us=[50, 90, 130, 170, 210, 250])
@@ -63,8 +66,7 @@ def test_streamed_gaze_is_what_the_host_computes_from_the_raw_frame(board):
     assert {frame.raw.model_crc for frame in frames} == {model.crc}
     for frame in frames:
         raw, gaze = frame.raw, frame.gaze
-        recentre_deg = raw.recentre.offset_deg
-        (az, el, flags), = host_gaze(model, np.array([raw.feature]), recentre_deg)
+        (az, el, flags), = host_gaze(model, np.array([raw.feature]), raw.recentre.offset_deg, raw.recentre.gain)
         flags |= raw.flags
         if raw.flags & (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_RECOVERING):
             flags &= ~lib.SG_FLAG_VALID
@@ -196,14 +198,16 @@ def test_recentre_belongs_to_its_model_and_survives_a_restart(board):
     stored, trial = random_model(64, seed=1), random_model(30, seed=2)
     features = random_features(20)
     nano, device = board(models={0: stored.image})
-    device.recentre((2.5, -1.0))
-    moved = host_gaze(stored, features, (2.5, -1.0))
+    gain = [[0.1, -0.03], [0.04, -0.2]]
+    device.recentre((2.5, -1.0), gain)
+    moved = host_gaze(stored, features, (2.5, -1.0), gain)
+    assert (moved != host_gaze(stored, features, (2.5, -1.0))).any()
     np.testing.assert_array_equal(device_gaze(device, features), moved)
 
     device.trial(trial.image)
-    assert device.recentre().azimuth_deg == 0       # another model, another offset
+    assert device.recentre().affine == wire.affine((0, 0))      # another model, another correction
     device.trial(None)
-    assert (device.recentre().azimuth_deg, device.recentre().elevation_deg) == (2.5, -1.0)
+    assert device.recentre().affine == wire.affine((2.5, -1.0), gain)
 
     device.link.sleep(0.5)                          # EEPROM takes 3.4 ms a byte
     nano.control.power(False)
@@ -215,12 +219,81 @@ def test_recentre_belongs_to_its_model_and_survives_a_restart(board):
     np.testing.assert_array_equal(device_gaze(device, features), host_gaze(stored, features))
 
 
-def test_a_recentre_offset_saturates_instead_of_wrapping(board):
+@pytest.mark.parametrize("offset, gain", [
+    ((255, -255), None), ((255, 255), [[0.248, 0.248], [0.248, 0.248]]),
+    ((-255, 0), [[-0.248, 0.248], [0.248, -0.248]]), ((0, 0), [[1 / 512, 0], [0, -1 / 512]])])
+def test_any_correction_is_bit_identical_and_saturates_instead_of_wrapping(board, offset, gain):
     model = random_model(64)
     _, device = board(models={0: model.image})
-    device.recentre((255, -255))
-    features = random_features(50)
-    np.testing.assert_array_equal(device_gaze(device, features), host_gaze(model, features, (255, -255)))
+    device.recentre(offset, gain)
+    features = random_features(100)
+    np.testing.assert_array_equal(device_gaze(device, features), host_gaze(model, features, offset, gain))
+
+
+def test_every_gain_of_the_wire_is_legal_also_the_most_negative(board):
+    model = random_model(64)
+    _, device = board(models={0: model.image})
+    odd = wire.Affine((-1, 1), (-128, 127, -128, -128))
+    body = wire.body("struct sg_recentre", op=lib.SG_RECENTRE_SET, affine=odd._asdict())
+    (answer,) = exchange(device, wire.encode(lib.SG_MSG_RECENTRE, 3, body))
+    assert wire.parse(wire.Recentre, answer.body).affine == odd
+    features = random_features(100)
+    gazes = replay.infer(model, features, recentre=np.array(tuple(odd), replay.AFFINE))
+    np.testing.assert_array_equal(device_gaze(device, features)[:, :2], gazes.q7)
+
+
+def live_record(version, model_crc, affine, boots):
+    """A copy of the live state in EEPROM as firmware of wire version 1 or 2 lays it out, sequence number 5."""
+    gain = bytes(value & 255 for value in affine.gain_q9) if version == 2 else b""
+    payload = (struct.pack("<Ihh", model_crc, *affine.offset_deg_q7) + gain
+               + struct.pack("<6HHBB", *[2000] * 6, boots, 0, version) + struct.pack("<H", 5))
+    return payload + binascii.crc_hqx(payload, 0xFFFF).to_bytes(2, "little")
+
+
+def test_the_live_state_of_the_firmware_before_is_read_and_left_where_it_was(board, tmp_path):
+    model, affine = random_model(20), wire.affine((1.5, -2.5), [[0.1, 0], [0, 0]])
+    state = tmp_path / "state"
+    state.mkdir()
+    old = live_record(1, model.crc, affine, 41)
+    assert len(old) == 28
+    for place in (0, 28):                           # either copy
+        (state / "eeprom.bin").write_bytes((bytes(place) + old).ljust(1024, b"\xff"))
+        nano, device = board(models={0: model.image}, state_dir=state)
+        assert device.recentre().affine == affine._replace(gain_q9=(0, 0, 0, 0))
+        assert device.status().boot_count == 42 and not device.exposure().automatic
+        device.link.sleep(0.5)
+        device.reboot()                             # now from its own record
+        assert device.status().boot_count == 43 and device.recentre().azimuth_deg == 1.5
+        device.close()
+        nano.stop()
+        assert (state / "eeprom.bin").read_bytes()[place:place + 28] == old
+
+
+def test_a_live_state_of_an_unknown_version_is_begun_afresh(board, tmp_path):
+    model = random_model(20)
+    state = tmp_path / "state"
+    state.mkdir()
+    unknown = bytearray(live_record(2, model.crc, wire.affine((1, 1)), 41))
+    unknown[27] = 77
+    unknown[30:32] = binascii.crc_hqx(bytes(unknown[:30]), 0xFFFF).to_bytes(2, "little")
+    (state / "eeprom.bin").write_bytes((b"\xff" * 56 + unknown).ljust(1024, b"\xff"))
+    _, device = board(models={0: model.image}, state_dir=state)
+    assert device.recentre().affine == wire.affine((0, 0)) and device.status().boot_count == 1
+
+
+def test_a_correction_set_while_the_one_before_is_written_is_the_one_kept(board):
+    model, gain = random_model(20), [[0.1, -0.03], [0.04, -0.2]]
+    nano, device = board(models={0: model.image})
+    device.link.sleep(0.5)
+    device.recentre((1.25, 2.5), gain)
+    for k in range(5):
+        device.link.sleep(0.011 * k)
+        device.recentre((k, -k), gain)
+    device.link.sleep(0.5)
+    nano.control.power(False)
+    nano.control.power(True)
+    device.connect()
+    assert device.recentre().affine == wire.affine((4, -4), gain)
 
 
 def test_model_images_are_exactly_what_was_stored(board):
@@ -234,15 +307,15 @@ def test_power_cut_while_the_offset_is_written_leaves_the_old_or_the_new(board, 
     model = random_model(20)
     nano, device = board(models={0: model.image})
     device.link.sleep(0.5)
-    device.recentre((1.25, 2.5))
+    old, new = ((1.25, 2.5), [[0.1, -0.03], [0.04, -0.2]]), ((-3.0, 4.75), [[-0.2, 0.01], [-0.06, 0.15]])
+    device.recentre(*old)
     device.link.sleep(0.5)
-    device.recentre((-3.0, 4.75))
+    device.recentre(*new)
     nano.control.cut(nano.control.time().cycle + int(after_ms * 16000))
     device.link.sleep(after_ms * 1e-3 - 0.0001)
     nano.control.command("time")
     nano.control.power(False)
     nano.control.power(True)
     device.connect()
-    now = device.recentre()
-    assert (now.azimuth_deg, now.elevation_deg) in ((1.25, 2.5), (-3.0, 4.75))
+    assert device.recentre().affine in (wire.affine(*old), wire.affine(*new))
     assert device.status().boot_count == 2

@@ -28,7 +28,7 @@ def encode(body, seq=0x0102, kind=0x41, flags=0):
 def decode(frame):
     """(body, seq, type, flags), or the error."""
     head, body = ffi.new("struct sg_head *"), ffi.new("uint8_t[64]")
-    n = lib.sg_wire_decode(frame, len(frame), head, body)
+    n = lib.sg_wire_decode(ffi.new("uint8_t[]", frame), len(frame), head, body)
     return n if n < 0 else (bytes(ffi.buffer(body, n)), head.seq, head.type, head.flags)
 
 
@@ -71,6 +71,18 @@ def test_encode_refuses_a_body_of_65_bytes_and_writes_nothing_beyond_72():
     assert bytes(out)[72:] == b"\xAA" * 8
 
 
+@pytest.mark.parametrize("kind", BODIES)
+def test_a_packet_in_a_ring_is_the_same_bytes_wherever_it_begins(kind):
+    for n in (0, 1, 12, 64):
+        body, head = BODIES[kind](n), ffi.new("struct sg_head *", [0x0102, 0x41, 0])
+        for at in range(80):
+            ring = ffi.new("uint8_t[90]", b"\xAA" * 90)
+            end = lib.sg_wire_encode_ring(head, body, n, ring, 80, at)
+            assert end == (at + n + 8) % 80 and bytes(ring)[80:] == b"\xAA" * 10
+            turned = bytes(ring)[at:80] + bytes(ring)[:at]
+            assert turned == encode(body) + b"\xAA" * (80 - n - 8)
+
+
 @given(st.binary(max_size=64), st.integers(0, 65535), st.integers(0, 255), st.integers(0, 255))
 @settings(max_examples=300, deadline=None)
 def test_round_trip_of_any_packet(body, seq, kind, flags):
@@ -105,7 +117,7 @@ def test_a_failed_decode_leaves_head_and_body_alone():
     frame = bytearray(encode(b"hello")[:-1])
     frame[-1] ^= 1
     head, body = ffi.new("struct sg_head *", [7, 7, 7]), ffi.new("uint8_t[64]", b"\x55" * 64)
-    assert lib.sg_wire_decode(bytes(frame), len(frame), head, body) == lib.SG_E_CRC
+    assert lib.sg_wire_decode(ffi.new("uint8_t[]", bytes(frame)), len(frame), head, body) == lib.SG_E_CRC
     assert (head.seq, head.type, head.flags) == (7, 7, 7) and bytes(body) == b"\x55" * 64
 
 

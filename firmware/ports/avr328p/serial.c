@@ -5,7 +5,8 @@
 #include "port_serial.h"
 
 enum {
-    TX_RING = 192,                      // a frame of all three streams (92), an answer (72), and some
+    TX_RING = 192,                      // a frame of all three streams (96), an answer (72), and some
+    AROUND_BODY = SG_WIRE_FRAME_MAX - SG_WIRE_BODY_MAX,
     BYTES_PER_POLL = 32,                // so that a flood of bytes cannot keep a frame waiting
     DRAIN_CYCLES = 4 * 10 * 2 * 16,     // the last two bytes leave the shift register, at the lower speed
 };
@@ -107,18 +108,13 @@ uint8_t serial_room(void)
     return (tail > head ? tail : tail + TX_RING) - head - 1;
 }
 
-uint8_t hal_send(const uint8_t *bytes, uint8_t n, uint8_t keep_free)
+uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_t keep_free)
 {
-    uint8_t head = tx_head;
-    if (after_pending || (uint16_t)n + keep_free > serial_room())
+    if (after_pending || (uint16_t)n + AROUND_BODY + keep_free > serial_room())
         return 0;
-    while (n--) {
-        tx_ring[head] = *bytes++;
-        if (++head == TX_RING)
-            head = 0;
-    }
+    const uint8_t end = (uint8_t)sg_wire_encode_ring(head, body, n, tx_ring, TX_RING, tx_head);
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
-        tx_head = head;
+        tx_head = end;
         UCSR0B = (1 << RXCIE0) | (1 << RXEN0) | (1 << TXEN0) | (1 << UDRIE0);
     }
     return 1;

@@ -2,7 +2,7 @@
 // The serial line with a send ring. QEMU hands a byte over when the last one was read: nothing is overrun.
 #include "port.h"
 
-enum { TX_RING = 256, BYTES_PER_POLL = 64 };
+enum { TX_RING = 256, AROUND_BODY = SG_WIRE_FRAME_MAX - SG_WIRE_BODY_MAX, BYTES_PER_POLL = 64 };
 
 static uint8_t tx_ring[TX_RING];
 static uint8_t tx_head;
@@ -32,12 +32,11 @@ void serial_start(void)
     SYSTICK_CTRL = 7;
 }
 
-uint8_t hal_send(const uint8_t *bytes, uint8_t n, uint8_t keep_free)
+uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_t keep_free)
 {
-    if (after_pending || room() < (uint16_t)n + keep_free)
+    if (after_pending || room() < n + AROUND_BODY + keep_free)
         return 0;
-    for (uint8_t i = 0; i < n; i++)
-        tx_ring[tx_head++] = bytes[i];
+    tx_head = (uint8_t)sg_wire_encode_ring(head, body, n, tx_ring, TX_RING, tx_head);
     return 1;
 }
 

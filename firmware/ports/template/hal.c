@@ -42,9 +42,10 @@ void hal_expose(const uint16_t exposure_cycles[HAL_CHANNELS])
     (void)exposure_cycles;
 }
 
-uint8_t hal_send(const uint8_t *bytes, uint8_t n, uint8_t keep_free)
+uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_t keep_free)
 {
-    (void)bytes;
+    (void)head;
+    (void)body;
     (void)n;
     (void)keep_free;
     return 0;
