@@ -192,17 +192,20 @@ class Device:
         slot = info.active if slot is None else slot
         if slot > lib.SG_SLOT_RAM or info.verdict[slot] != lib.SG_OK:
             raise refusal(lib.SG_E_MAGIC, lib.SG_MSG_MODEL_READ)
-        size = lib.SG_MODEL_HEAD_BYTES + info.vectors[slot] * lib.SG_MODEL_RECORD_BYTES
-        return self.read_slot(slot, size)
+        head = self.read_slot(slot, lib.SG_MODEL_PAGE)
+        length = wire.ffi.from_buffer("struct sg_model_head *", head).length
+        if not len(head) < length <= self.hello.slot_bytes:
+            raise ProtocolError(f"the device calls a model of {length} bytes valid", "try again")
+        return head + self.read_slot(slot, length - len(head), len(head))
 
-    def read_slot(self, slot, size):
-        """`size` bytes as they stand in `slot`, model or not."""
+    def read_slot(self, slot, size, start=0):
+        """`size` bytes from `start` on as they stand in `slot`, model or not."""
         image = bytearray()
         while len(image) < size:
             step = min(lib.SG_WIRE_DATA_MAX, size - len(image))
-            body = wire.body("struct sg_model_at", offset=len(image), slot=slot, length=step)
+            body = wire.body("struct sg_model_at", offset=start + len(image), slot=slot, length=step)
             _, offset, data = wire.parse_data(self._exchange.request(lib.SG_MSG_MODEL_READ, body))
-            if offset != len(image) or len(data) != step:
+            if offset != start + len(image) or len(data) != step:
                 raise ProtocolError("the device answered with another part of the model than asked for",
                                     "try again")
             image += data
