@@ -15,26 +15,31 @@ from sparsegaze.model import DeviceModel
 from sparsegaze.wire import lib
 
 # Of what the host's core and the device both compute; changes only with the arithmetic itself.
-GOLDEN_CRC = {1: 0xE0417233, 64: 0x904942B0, 216: 0x1E3C2578}
+GOLDEN_CRC = {1: 0x8FC331C8, 64: 0x3292813A, 216: 0x9EE99F22}
+
+
+def head_at(field):
+    return wire.ffi.offsetof("struct sg_model_head", field)
 
 
 def flat_model():
     """A model whose range is the features of the dark, 42000 .. 52000: bright light is out of it."""
     return DeviceModel.from_parts(
         offset=[42000] * 6, gain_q12=[1600] * 6, bias=[0, 0], trend=np.zeros((2, 6), int),
-        centres=np.full((1, 6), 128), weights=np.zeros((1, 2), int), weight_frac_bits=8, generation=1, guards=[])
+        centres=np.full((1, 6), 128), weights=np.zeros((1, 2), int), weight_frac_bits=8, generation=1)
 
 
 def host_gaze(model, features, recentre_deg=(0.0, 0.0), gain=None):
-    """[n, 3] integers azimuth, elevation (1/128 deg) and flags, as the host's core computes them."""
+    """[n, 4] integers azimuth, elevation (1/128 deg), flags and sigma's code, as the host's core computes them."""
     affine = np.array(tuple(wire.affine(recentre_deg, gain)), replay.AFFINE)
     gazes = replay.infer(model, features, recentre=affine)
-    return np.column_stack([gazes.q7, gazes.flags]).astype(np.int32)
+    return np.column_stack([*gazes]).astype(np.int32)
 
 
 def device_gaze(device, features):
     found = device.infer(features)
-    return np.stack([found.azimuth_deg * 128, found.elevation_deg * 128, found.flags], 1).astype(np.int32)
+    sigma = replay.sigma_code(found.sigma_deg)
+    return np.stack([found.azimuth_deg * 128, found.elevation_deg * 128, found.flags, sigma], 1).astype(np.int32)
 
 
 def test_infer_is_bit_identical_to_the_host_core(board):
@@ -66,11 +71,12 @@ def test_streamed_gaze_is_what_the_host_computes_from_the_raw_frame(board):
     assert {frame.raw.model_crc for frame in frames} == {model.crc}
     for frame in frames:
         raw, gaze = frame.raw, frame.gaze
-        (az, el, flags), = host_gaze(model, np.array([raw.feature]), raw.recentre.offset_deg, raw.recentre.gain)
+        (az, el, flags, sigma), = host_gaze(model, np.array([raw.feature]), raw.recentre.offset_deg, raw.recentre.gain)
         flags |= raw.flags
         if raw.flags & (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_RECOVERING):
             flags &= ~lib.SG_FLAG_VALID
         assert (gaze.azimuth_deg_q7, gaze.elevation_deg_q7, gaze.flags) == (az, el, flags)
+        assert gaze.sigma_log2_q4 == sigma
         assert gaze.t_us == raw.t_us
     assert any(frame.raw.flags & lib.SG_FLAG_EXPOSURE for frame in frames)
 
@@ -180,8 +186,8 @@ def test_writing_a_trial_leaves_the_one_in_use_before_it_changes(board):
 
 
 @pytest.mark.parametrize("at, error",
-                         [(300, lib.SG_E_CRC), (0, lib.SG_E_MAGIC), (96, lib.SG_E_VERSION),
-                          (98, lib.SG_E_BOUNDS)],
+                         [(300, lib.SG_E_CRC), (0, lib.SG_E_MAGIC), (head_at("version"), lib.SG_E_VERSION),
+                          (head_at("vectors"), lib.SG_E_BOUNDS)],
                          ids=["record_flipped", "magic", "version", "vectors"])
 def test_a_bad_trial_is_refused_and_the_stored_model_stays_in_use(board, at, error):
     stored, damaged = random_model(20, seed=1), bytearray(random_model(20, seed=2).image)

@@ -34,8 +34,7 @@ def test_hello_says_what_the_board_is(board):
     assert hello.board == lib.SG_BOARD_NANO328P and hello.channels == 6 and hello.cpu_hz == 16_000_000
     assert hello.slot_base == (0x6000, 0x6C00) and hello.slot_bytes == lib.SG_MODEL_SLOT_BYTES
     assert hello.page_bytes == 128 and hello.frame_period_us == 3840
-    vectors = lib.SG_MODEL_TRIAL_VECTORS_MAX
-    assert hello.trial_bytes == lib.SG_MODEL_HEAD_BYTES + vectors * lib.SG_MODEL_RECORD_BYTES
+    assert hello.trial_bytes == 880
     assert 0 < hello.exposure_min_us < hello.exposure_max_us <= 304
 
 
