@@ -101,12 +101,12 @@ class Exchange:
                 self.send(kind, body, seq)
         raise self._silent()
 
-    def request_many(self, kind, bodies, take):
-        """Send many requests of one kind, several under way at a time; take(i, answer's body) for each, in
+    def request_many(self, kind, bodies, take, window=WINDOW):
+        """Send many requests of one kind, `window` under way at a time; take(i, answer's body) for each, in
         any order."""
         waiting, todo = {}, deque((i, 0) for i in range(len(bodies)))
         while todo or waiting:
-            while todo and len(waiting) < WINDOW:
+            while todo and len(waiting) < window:
                 i, tries = todo.popleft()
                 if tries == MANY_TRIES:
                     raise self._silent()

@@ -4,6 +4,8 @@
 import itertools
 import json
 import math
+import os
+import signal
 
 import numpy as np
 import pytest
@@ -24,10 +26,10 @@ MODELS = {"64 vectors": (64, 6), "one vector, one channel": (1, 1), "three chann
 
 
 def hard_features(n=500, seed=0):
-    """[n, 6]: all 0, all 65535, every corner of the box that random_model spans, then random ones."""
-    corners = np.array(list(itertools.product((31000, 40000), repeat=CHANNELS)))
-    ends = np.array([[0] * CHANNELS, [65535] * CHANNELS, [0, 65535] * 3, [65535, 0] * 3])
-    features = np.concatenate([ends, corners, random_features(n - len(ends) - len(corners), seed)])
+    """[n, 6]: every corner of what features can be and of the box that random_model spans, random ones."""
+    corners = [list(itertools.product(ends, repeat=CHANNELS)) for ends in ((0, 65535), (31000, 40000))]
+    features = np.concatenate([*corners, random_features(n - 2 * 2 ** CHANNELS, seed)])
+    assert (features == 0).all(1).any() and (features == 65535).all(1).any()
     assert len(features) == n
     return features.astype(np.uint16)
 
@@ -151,6 +153,22 @@ def test_noise_on_the_line_of_the_cortex_m4_harms_nothing():
         assert device.status().stack_free > 4000
 
 
+def test_a_program_that_stops_answering_is_given_up(monkeypatch):
+    class Stopped(qemu.QemuBoard):
+        def __init__(self, image):
+            super().__init__(image)
+            os.kill(self.pid, signal.SIGSTOP)
+
+        def close(self):
+            os.kill(self.pid, signal.SIGCONT)
+            super().close()
+
+    monkeypatch.setattr(module, "QemuBoard", Stopped)
+    with pytest.raises(VirtualError, match="does not answer") as caught:
+        predict(random_model(4), random_features(2), "cortex-m4")
+    assert "make firmware" in caught.value.remedy
+
+
 def test_a_reboot_ends_qemu_and_is_noticed():
     with qemu.QemuBoard() as board, Device(board) as device:
         with pytest.raises(DisconnectedError, match="the program in it ended"):
@@ -205,6 +223,25 @@ def test_rows_out_of_range_keep_their_numbers_and_are_flagged(tmp_path, capsys):
     assert all(flags & FLAG_OUT_OF_RANGE and not flags & FLAG_VALID for flags in said["flags"])
     assert all(isinstance(value, float) for value in said["azimuth_deg"] + said["elevation_deg"])
     assert "error" not in said      # the file has no targets
+
+
+def test_targets_without_a_single_gaze_leave_the_error_null(tmp_path, capsys):
+    random_model(4).save(tmp_path / "m.sgm")
+    Recording(np.arange(3), np.zeros((3, CHANNELS)), np.zeros((3, 2)), np.ones(3)).write(tmp_path / "r.csv")
+    assert run(["predict", str(tmp_path / "m.sgm"), str(tmp_path / "r.csv"), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["error"] == {"mean_deg": None, "median_deg": None, "p95_deg": None, "rows": 0}
+    assert run(["predict", str(tmp_path / "m.sgm"), str(tmp_path / "r.csv")]) == 0
+    assert "100.0 % flagged" in capsys.readouterr().out
+
+
+def test_sigma_is_null_only_where_the_model_has_none(files, capsys):
+    model, path, _ = files
+    assert run(["predict", model, path, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    good = [sigma for sigma, flags in zip(said["sigma_deg"], said["flags"]) if flags & FLAG_VALID]
+    flagged = [sigma for sigma, flags in zip(said["sigma_deg"], said["flags"]) if not flags & FLAG_VALID]
+    assert good and flagged and all(0 < sigma < 230 for sigma in good) and min(flagged) > 230
 
 
 def test_error_to_the_targets_is_told_over_the_rows_that_are_a_gaze(files, capsys):

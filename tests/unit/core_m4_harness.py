@@ -159,6 +159,20 @@ def run_cases(directory, body, inputs, out_bytes, includes=(), setup="", data=No
     data      {name: bytes}, constant arrays of that name that setup and body may read (8-aligned)
     wrap      name of a function of the core that is called from another file
     """
+    elf = build(directory, body, inputs, out_bytes, includes, setup, data, wrap)
+    output, counts = run_elf(elf)
+    assert len(output) == len(inputs) * out_bytes, f"the program wrote {len(output)} bytes"
+    function = None
+    if wrap:
+        assert SECTION_FUNCTION in counts, f"{wrap} is not called from another file"
+        # The empty function is one instruction: its return.
+        function = counts[SECTION_FUNCTION] - counts[SECTION_NOTHING][0] + 1
+    return Result(np.frombuffer(output, np.uint8).reshape(len(inputs), out_bytes), counts[SECTION_CASE],
+                  function, elf)
+
+
+def build(directory, body, inputs, out_bytes, includes=(), setup="", data=None, wrap=None):
+    """The program of run_cases, not run; returns its path."""
     directory = pathlib.Path(directory)
     inputs = np.ascontiguousarray(inputs)
     rows = inputs.view(np.uint8).reshape(len(inputs), -1)
@@ -183,15 +197,7 @@ def run_cases(directory, body, inputs, out_bytes, includes=(), setup="", data=No
     own = [compile_one(directory / name, directory, [directory]) for name in ("case_main.c", "case_wrap.s")]
     elf = directory / "case.elf"
     run([tool("gcc"), *FLAGS, *flags, *core_objects(), *own, "-o", elf])
-    output, counts = run_elf(elf)
-    assert len(output) == len(padded) * out_bytes, f"the program wrote {len(output)} bytes"
-    function = None
-    if wrap:
-        assert SECTION_FUNCTION in counts, f"{wrap} is not called from another file"
-        # The empty function is one instruction: its return.
-        function = counts[SECTION_FUNCTION] - counts[SECTION_NOTHING][0] + 1
-    return Result(np.frombuffer(output, np.uint8).reshape(len(padded), out_bytes), counts[SECTION_CASE],
-                  function, elf)
+    return elf
 
 
 def run_elf(elf):

@@ -7,7 +7,10 @@ import pytest
 
 import core_m4_harness as m4
 from core_models import random_parts
+from sparsegaze import qemu
 from sparsegaze._core import ffi, lib
+from sparsegaze.device import Device
+from sparsegaze.errors import NoDeviceError
 from test_core_avr import READINGS, gaze_bytes
 from test_core_gp import GOLDEN_CRC, golden_case
 
@@ -73,6 +76,14 @@ def test_a_wrong_instruction_in_the_core_would_be_seen(tmp_path):
     wrong = m4.run_cases(tmp_path, INFER + " out[4] ^= i == 63;", feature, 12, ["sg_track.h", "sg_err.h"],
                          OPEN, {"image": parts.image()})
     assert zlib.crc32(wrong.output.tobytes()) != GOLDEN_CRC
+
+
+def test_a_program_that_floods_the_line_is_no_device(tmp_path):
+    flood = m4.build(tmp_path, "for (uint32_t k = 0; ; k++) UART_DATA(UART_LINE) = (uint8_t)(k * 7);",
+                     np.zeros((1, 1), np.uint8), 1)
+    with qemu.QemuBoard(program=flood) as board:
+        with pytest.raises(NoDeviceError, match="not in sparsegaze's protocol"):
+            Device(board, timeout_s=1.0)
 
 
 def test_a_program_that_faults_is_an_error_and_no_hang(tmp_path):

@@ -4,7 +4,7 @@
 #include "port.h"
 
 // Turns without a byte before the sleep: checks of models go on in them.
-enum { IDLE_TURNS = 1000 };
+enum { IDLE_TURNS = 64 };
 
 static uint16_t idle;
 static uint32_t now_us;
