@@ -62,8 +62,7 @@ def rounded(x):
 def exp_table():
     """2^16 exp(-i / 128), i = 0..1663, Q0.16; zeros behind the last that is not.
 
-    The device goes on from a node along its tangent, with the upper byte of the level only: what that misses in
-    the mean, and half a step for its floor, is put into the nodes."""
+    The device goes on from a node along its tangent, with the upper byte of the level only."""
     level = [math.floor(65536 * math.exp(-i / 128)) for i in range(1664)]
     level[0] = 65535
     return level

@@ -25,12 +25,11 @@ struct sg_gp_point {
 
 // Predict the gaze at one point.
 //
-//   view      opened by sg_model_open(); borrowed, not modified. n in 1..234, d in 1..6.
+//   view      opened by sg_model_open(); borrowed, not modified. n in 1..233, d in 1..6.
 //   feature   6 entries, log2 photocurrent, 1/4096 octave; entries d..5 are not looked at. Every value is
 //             legal.
 //   point     written whole. OUT_OF_RANGE when a feature was clamped, a guard's projection left its range,
-//             the doubt is above the model's limit or an angle saturated; sigma is then HUGE. Without a grid
-//             sigma is UNKNOWN.
+//             the doubt is above the model's limit or an angle saturated; sigma is then HUGE.
 //
 // Scaling and overflow
 //   difference x - offset: unsigned 16 bits after the clamp at 0; times gain Q4.12 in 32 bits unsigned
@@ -43,7 +42,7 @@ struct sg_gp_point {
 //   final value must fit, and the host proves that it does for every input that no range flags
 //   (host_sdk/sparsegaze/rounding.py, reach). The result is the accumulator >> (weight_frac_bits + 1). The
 //   order of the vectors does not matter, to the bit.
-//   projections: 22 bits, >> 8: |p| < 2^14. m: four squares of 7 bits: 16 bits.
+//   projections: |p| <= 63 * 255 < 2^14. m: four squares of 7 bits: 16 bits.
 // Accuracy
 //   |k - 2^16 exp(-T / 2^16)| <= 3 LSB for the T of this function: floor of the level 1, of the drop 1, low byte
 //   of the level left out of the drop 2 one way; curvature 2 the other way. S2 being rounded up adds 1. Left out

@@ -7,6 +7,7 @@
 
 #define SUM_S2 8
 #define SUM_S 12
+#define SUM_S8 24
 
 ; ---- void sg_gp_loop(struct sg_gp_sum *sum r25:r24, const uint8_t *record r23:r22, uint8_t n r20,
 ;                      uint8_t space r18)
@@ -200,7 +201,6 @@ done:
 ; ---- The other loops: X walks s, Z the coefficients
 #undef c
 #undef zero
-#define zero r27                /* set after X is done with, or none is needed */
 #define low r18
 #define high r19
 #define factor r20
@@ -210,64 +210,163 @@ done:
 #define acc2 r24
 #define acc3 r25
 
-; void sg_gp_square(struct sg_gp_sum *sum r25:r24)
-    .section .text.sg_gp_square, "ax", @progbits
-    .global sg_gp_square
-    .type sg_gp_square, @function
-sg_gp_square:
-    movw r30, r24
-    adiw r30, SUM_S
-    ldi acc0, 31
-    clr acc1
-    clr acc2
-    clr acc3
-    clr zero
-    ldi count, 6
+; uint8_t sg_gp_scale(struct sg_gp_sum *sum r25:r24, const uint16_t feature[6] r23:r22,
+;                     const uint8_t *offset r21:r20, uint8_t space r18)
+; X walks the features, Y s, Z the offsets; the gains lie 12 bytes further.
+#define square0_ r12
+#define square1_ r13
+#define square2_ r14
+#define square3_ r15
+#define out r16
+#define zero r17
+#define gain0 r20
+#define gain1 r21
+#define mask r22
+#define p1 r23                  /* bytes 1 to 3 of the product */
+#define p2 r24
+#define p3 r25
+#define channels_left r11
+
+.macro scale load
 1:
-    ld low, Z+
-    ld high, Z+
-    mul low, low
-    add acc0, r0
-    adc acc1, r1
-    adc acc2, zero
-    adc acc3, zero
-    mul low, high               ; twice, below 2^13
+    ld low, X+
+    ld high, X+
+    \load gain0, Z+
+    \load gain1, Z+
+    sub low, gain0
+    sbc high, gain1
+    sbc mask, mask              ; all ones below the offset
+    or out, mask
+    com mask
+    and low, mask
+    and high, mask
+    adiw r30, 10
+    \load gain0, Z+
+    \load gain1, Z+
+    sbiw r30, 12
+    mul high, gain1
+    movw p2, r0
+    mul low, gain0
+    mov p1, r1
+    mul low, gain1
+    add p1, r0
+    adc p2, r1
+    adc p3, zero
+    mul high, gain0
+    add p1, r0
+    adc p2, r1
+    adc p3, zero
+    cp zero, p3
+    sbc mask, mask              ; all ones from 2^24 on
+    or out, mask
+    or p1, mask
+    or p2, mask
+    push p2                     ; s >> 4, stored when all are known
+    swap p1                     ; p2:p1 >> 4
+    swap p2
+    andi p1, 0x0F
+    eor p1, p2
+    andi p2, 0x0F
+    eor p1, p2
+    st Y+, p1
+    st Y+, p2
+    mul p1, p1
+    add square0_, r0
+    adc square1_, r1
+    adc square2_, zero
+    adc square3_, zero
+    mul p1, p2                  ; twice, below 2^13
     lsl r0
     rol r1
-    add acc1, r0
-    adc acc2, r1
-    adc acc3, zero
-    mul high, high              ; one byte
-    add acc2, r0
-    adc acc3, zero
-    dec count
+    add square1_, r0
+    adc square2_, r1
+    adc square3_, zero
+    mul p2, p2                  ; one byte
+    add square2_, r0
+    adc square3_, zero
+    dec channels_left
     brne 1b
-    ldi count, 3                ; >> 5 is << 3 and the upper three bytes
-2:
-    lsl acc0
-    rol acc1
-    rol acc2
-    rol acc3
-    dec count
-    brne 2b
-    sbiw r30, 24 - SUM_S2
-    st Z, acc1
-    std Z+1, acc2
-    std Z+2, acc3
-    std Z+3, zero
-    clr r1
-    ret
-    .size sg_gp_square, . - sg_gp_square
+.endm
 
-; void sg_gp_trend(struct sg_gp_sum *sum r25:r24, const uint8_t *trend r23:r22, uint8_t space r20)
+    .section .text.sg_gp_scale, "ax", @progbits
+    .global sg_gp_scale
+    .type sg_gp_scale, @function
+sg_gp_scale:
+    push channels_left
+    push square0_
+    push square1_
+    push square2_
+    push square3_
+    push out
+    push zero
+    push r28
+    push r29
+    bst r18, 0                  ; T: SG_ROM_FLASH
+    movw r26, r22
+    movw r28, r24
+    adiw r28, SUM_S
+    movw r30, r20
+    clr zero
+    clr out
+    ldi mask, 6
+    mov channels_left, mask
+    ldi mask, 31
+    mov square0_, mask
+    clr square1_
+    clr square2_
+    clr square3_
+    brtc 2f
+    scale lpm
+    rjmp 3f
+2:
+    scale ld
+3:
+    ldi mask, 3                 ; >> 5 is << 3 and the upper three bytes
+4:
+    lsl square0_
+    rol square1_
+    rol square2_
+    rol square3_
+    dec mask
+    brne 4b
+    pop mask                    ; Y is behind s, where s >> 4 begins
+    std Y+5, mask
+    pop mask
+    std Y+4, mask
+    pop mask
+    std Y+3, mask
+    pop mask
+    std Y+2, mask
+    pop mask
+    std Y+1, mask
+    pop mask
+    st Y, mask
+    sbiw r28, 24 - SUM_S2
+    st Y, square1_
+    std Y+1, square2_
+    std Y+2, square3_
+    std Y+3, zero
+    mov r24, out
+    andi r24, 4                 ; SG_GP_OUT_OF_RANGE
+    clr r1
+    pop r29
+    pop r28
+    pop zero
+    pop out
+    pop square3_
+    pop square2_
+    pop square1_
+    pop square0_
+    pop channels_left
+    ret
+    .size sg_gp_scale, . - sg_gp_scale
 #undef zero
+
+; void sg_gp_trend(struct sg_gp_sum *sum r25:r24, const uint8_t *bias r23:r22, uint8_t space r20)
+; Elevation's bias waits in its accumulator while azimuth is done.
 #define zero r17
-; acc = acc + trend * s over six channels
-.macro sum_trend load
-    movw r26, r28
-    adiw r26, SUM_S
-    ldi count, 6
-1:
+; acc = acc + trend * s for one channel: s16 * u12
+.macro slope load
     ld low, X+
     ld high, X+
     \load factor, Z+
@@ -289,32 +388,49 @@ sg_gp_square:
     mulsu factor, high
     add acc2, r0
     adc acc3, r1
-    dec count
-    brne 1b
 .endm
 
-.macro output at
-    ldd acc0, Y+\at
-    ldd acc1, Y+\at+1
-    ldd acc2, Y+\at+2
-    ldd acc3, Y+\at+3
-    brtc 2f
-    sum_trend lpm
-    rjmp 3f
-2:
-    sum_trend ld
-3:
+.macro output load, at
+    movw r26, r28
+    adiw r26, SUM_S
+    slope \load
+    slope \load
+    slope \load
+    slope \load
+    slope \load
+    slope \load
     ldi count, 4                ; >> 4 is << 4 and the upper three bytes
-4:
+1:
     lsl acc0
     rol acc1
     rol acc2
     rol acc3
     dec count
-    brne 4b
+    brne 1b
     std Y+\at, acc1
     std Y+\at+1, acc2
     std Y+\at+2, acc3
+.endm
+
+.macro outputs load
+    \load acc0, Z+
+    \load acc1, Z+
+    \load acc2, Z+
+    \load acc3, Z+
+    \load r0, Z+
+    \load r1, Z+
+    std Y+4, r0
+    std Y+5, r1
+    \load r0, Z+
+    \load r1, Z+
+    std Y+6, r0
+    std Y+7, r1
+    output \load, 0
+    ldd acc0, Y+4
+    ldd acc1, Y+5
+    ldd acc2, Y+6
+    ldd acc3, Y+7
+    output \load, 4
 .endm
 
     .section .text.sg_gp_trend, "ax", @progbits
@@ -325,11 +441,15 @@ sg_gp_trend:
     push r28
     push r29
     clr zero
-    bst r20, 0                  ; T: SG_ROM_FLASH
     movw r28, r24
     movw r30, r22
-    output 0
-    output 4
+    sbrs r20, 0                 ; SG_ROM_FLASH
+    rjmp 2f
+    outputs lpm
+    rjmp 3f
+2:
+    outputs ld
+3:
     pop r29
     pop r28
     pop zero
@@ -337,49 +457,201 @@ sg_gp_trend:
     ret
     .size sg_gp_trend, . - sg_gp_trend
 
-; int16_t sg_gp_project(const struct sg_gp_sum *sum r25:r24, const uint8_t *row r23:r22, uint8_t space r20)
+; void sg_gp_judge(const struct sg_gp_sum *sum r25:r24, const struct sg_gp_place *place r23:r22,
+;                  const uint8_t *guard r21:r20, uint8_t space r18, struct sg_gp_opinion *opinion r17:r16)
+; Y holds s >> 4, X the guard, Z what is read.
 #undef zero
-#define zero r25
-.macro project load
-1:
-    \load factor, Z+
-    ld low, X+
-    mulsu factor, low
-    sbc acc2, zero              ; carry is the product's sign
-    add acc0, r0
-    adc acc1, r1
-    adc acc2, zero
-    ld low, X+
-    mulsu factor, low
-    add acc1, r0
-    adc acc2, r1
-    dec count
-    brne 1b
+#define zero r14
+#define doubt0 r12
+#define doubt1 r13
+#define node0 r2                /* pairs r3:r2 and r5:r4: the nodes' byte of this guard */
+#define node1 r4
+#define share0 r6
+#define share1 r7
+#define share2 r8
+#define share3 r9
+#define guards_left r10
+#define seen r11
+#define value r20
+#define part r21
+
+.macro corners load, node, first, second
+    movw r30, \node
+    \load value, Z
+    mul value, \first
+    add low, r0
+    adc high, r1
+    adiw r30, 5
+    \load value, Z
+    mul value, \second
+    add low, r0
+    adc high, r1
 .endm
 
-    .section .text.sg_gp_project, "ax", @progbits
-    .global sg_gp_project
-    .type sg_gp_project, @function
-sg_gp_project:
-    movw r26, r24
-    adiw r26, SUM_S
-    movw r30, r22
-    clr zero
-    clr acc0
+; acc2:acc1 += row * (s >> 4) for one channel
+.macro project load, at
+    \load value, Z+
+    ldd low, Y+\at
+    mulsu value, low
+    add acc1, r0
+    adc acc2, r1
+.endm
+
+.macro guard load
+1:
+    movw r30, r26               ; base and range later
+    adiw r30, 6
     clr acc1
     clr acc2
-    ldi count, 6
-    sbrs r20, 0                 ; SG_ROM_FLASH
-    rjmp 2f
-    project lpm
-    rjmp 3f
-2:
-    project ld
+    project \load, 0
+    project \load, 1
+    project \load, 2
+    project \load, 3
+    project \load, 4
+    project \load, 5
+    movw r30, r26               ; acc2:acc1 is the projection
+    \load acc0, Z+
+    \load acc3, Z+              ; base
+    \load low, Z+
+    \load high, Z+
+    cp acc1, low                ; below low?
+    cpc acc2, high
+    ldi value, 0
+    brge 3f                     ; as long as the instruction it jumps over
+    ldi value, 4
 3:
+    or seen, value
+    \load low, Z+
+    \load high, Z+
+    cp low, acc1                ; above high?
+    cpc high, acc2
+    ldi value, 0
+    brge 4f
+    ldi value, 4
+4:
+    or seen, value
+    adiw r26, 12
+    sub acc1, acc0
+    sbc acc2, acc3
+    clr low
+    clr high
+    corners \load, node0, share0, share1
+    corners \load, node1, share2, share3
+    sec
+    adc node0, zero
+    adc r3, zero
+    sec
+    adc node1, zero
+    adc r5, zero
+    swap low                    ; high:low >> 4
+    swap high
+    andi low, 0x0F
+    eor low, high
+    andi high, 0x0F
+    eor low, high
+    sub acc1, low
+    sbc acc2, high
+    mov value, acc2             ; magnitude
+    lsl value
+    sbc value, value
+    eor acc1, value
+    eor acc2, value
+    sub acc1, value
+    sbc acc2, value
+    cpi acc1, 128               ; at most 127
+    cpc acc2, zero
+    sbc value, value
+    and acc1, value
+    com value
+    andi value, 127
+    or acc1, value
+    mul acc1, acc1
+    add doubt0, r0
+    adc doubt1, r1
+    dec guards_left
+    breq 5f
+    rjmp 1b
+5:
+.endm
+
+; the nodes' next byte, which is sigma's, into high
+.macro sigma load
+    clr low
+    clr high
+    corners \load, node0, share0, share1
+    corners \load, node1, share2, share3
+    lsl low
+    rol high
+.endm
+
+    .section .text.sg_gp_judge, "ax", @progbits
+    .global sg_gp_judge
+    .type sg_gp_judge, @function
+sg_gp_judge:
+    push r2
+    push r3
+    push r4
+    push r5
+    push r6
+    push r7
+    push r8
+    push r9
+    push r10
+    push r11
+    push r12
+    push r13
+    push r14
+    push r28
+    push r29
+    movw r30, r22
+    ld r2, Z
+    ldd r3, Z+1
+    ldd r4, Z+2
+    ldd r5, Z+3
+    ldd share0, Z+4
+    ldd share1, Z+5
+    ldd share2, Z+6
+    ldd share3, Z+7
+    movw r28, r24
+    adiw r28, SUM_S8
+    movw r26, r20
+    clr zero
+    clr seen
+    clr doubt0
+    clr doubt1
+    ldi value, 4
+    mov guards_left, value
+    sbrs r18, 0                 ; SG_ROM_FLASH
+    rjmp 6f
+    guard lpm
+    sigma lpm
+    rjmp 7f
+6:
+    guard ld
+    sigma ld
+7:
+    movw r30, r16
+    st Z, doubt0
+    std Z+1, doubt1
+    std Z+2, high
+    std Z+3, seen
     clr r1
-    mov r25, acc2               ; bytes 1 and 2 of the sum
-    mov r24, acc1
+    pop r29
+    pop r28
+    pop r14
+    pop r13
+    pop r12
+    pop r11
+    pop r10
+    pop r9
+    pop r8
+    pop r7
+    pop r6
+    pop r5
+    pop r4
+    pop r3
+    pop r2
     ret
-    .size sg_gp_project, . - sg_gp_project
+    .size sg_gp_judge, . - sg_gp_judge
 
 #endif

@@ -12,23 +12,44 @@ enum { SG_GP_EXP_ENTRIES = 1664 };
 extern const uint16_t sg_gp_exp_table[SG_GP_EXP_ENTRIES];
 
 struct sg_gp_sum {
-    uint32_t acc[2];    // azimuth and elevation; sg_gp_trend: Q.(weight_frac_bits + 12), sg_gp_loop: 24 bits
+    uint32_t acc[2];    // azimuth and elevation, Q.(weight_frac_bits + 8), 24 bits
     uint32_t s2;        // (sum s^2 + 31) >> 5
     uint16_t s_u8q4[6]; // 0..4095
+    uint8_t s_u8[6];    // s >> 4
+};
+
+// Where a gaze lies in the grid: nodes of the cell's two rows, and the shares of its corners, 128 in all.
+struct sg_gp_place {
+    const uint8_t *node[2];     // lower and upper row: the first of two nodes each
+    uint8_t share[4];           // 00, 10 (one further in azimuth), 01 (in elevation), 11
 };
 
 // The assembly knows these places.
-_Static_assert(offsetof(struct sg_gp_sum, s2) == 8 && offsetof(struct sg_gp_sum, s_u8q4) == 12, "sum layout");
+_Static_assert(offsetof(struct sg_gp_sum, s2) == 8 && offsetof(struct sg_gp_sum, s_u8q4) == 12
+               && offsetof(struct sg_gp_sum, s_u8) == 24, "sum layout");
 
-// sum->s2 from sum->s_u8q4.
-void sg_gp_square(struct sg_gp_sum *sum);
+// The rest of *sum from six features.
+//   offset   uint16[6], and behind them uint16[6] gains Q4.12, as stored, in `space`
+// Returns 0, or SG_GP_OUT_OF_RANGE where it had to clamp.
+uint8_t sg_gp_scale(struct sg_gp_sum *sum, const uint16_t feature[6], const uint8_t *offset, uint8_t space);
 
-// sum->acc = (sum->acc + trend * s) >> 4, to 24 bits: the upper 8 are of no meaning.
-//   trend: int16[2][6] as stored, in `space`
-void sg_gp_trend(struct sg_gp_sum *sum, const uint8_t *trend, uint8_t space);
+// sum->acc = (bias + trend * s) >> 4, to 24 bits: the upper 8 are of no meaning.
+//   bias   int32[2], and behind it the trend, int16[2][6], as stored, in `space`
+void sg_gp_trend(struct sg_gp_sum *sum, const uint8_t *bias, uint8_t space);
 
-// Returns row * s >> 8, below 2^14 in magnitude.   row: int8[6] as stored, in `space`
-int16_t sg_gp_project(const struct sg_gp_sum *sum, const uint8_t *row, uint8_t space);
+// What the model says of a point, before its limit is asked.
+struct sg_gp_opinion {
+    uint16_t doubt;             // m
+    uint8_t sigma_log2_q4;      // of the grid
+    uint8_t out;                // SG_GP_OUT_OF_RANGE if a projection is outside its range, else 0
+};
+
+_Static_assert(sizeof(struct sg_gp_opinion) == 4, "opinion layout");
+
+//   guard   struct sg_model_guard[4] as stored, in `space`, as the nodes of `place` are; a guard that is not in
+//           use is zero and costs what the others do
+void sg_gp_judge(const struct sg_gp_sum *sum, const struct sg_gp_place *place, const uint8_t *guard,
+                 uint8_t space, struct sg_gp_opinion *opinion);
 
 // sum->acc += weight_i * k_i over n records, modulo 2^24; the upper 8 bits of acc are of no meaning.
 //

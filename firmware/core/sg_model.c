@@ -32,13 +32,11 @@ uint32_t sg_model_crc32(uint32_t crc, const uint8_t *data, size_t n)
     return ~crc;
 }
 
-// Bytes of the grid, 0 without one, or SG_E_BOUNDS.
+// Bytes of the grid, or SG_E_BOUNDS.
 static int grid_bytes(const uint8_t *image, uint8_t space)
 {
     const uint8_t wide = sg_rom_byte(image + TRUST(nodes), space);
     const uint8_t high = sg_rom_byte(image + TRUST(nodes) + 1, space);
-    if (wide == 0 && high == 0)
-        return 0;
     if (wide < 2 || wide > SG_MODEL_NODES_MAX || high < 2 || high > SG_MODEL_NODES_MAX)
         return SG_E_BOUNDS;
     return (int)((uint16_t)((uint16_t)wide * high) * SG_MODEL_NODE_BYTES);
@@ -89,6 +87,15 @@ static uint8_t within(uint16_t value, int16_t low, int16_t high)
     return sg_q_signed16(value) >= low && sg_q_signed16(value) <= high;
 }
 
+// A channel without gain has no offset either.
+static uint8_t idle_offset(const uint8_t *image, uint8_t space)
+{
+    uint8_t idle = 0;
+    for (uint8_t j = 0; j < 2U * SG_MODEL_CHANNELS; j += 2)
+        idle |= !sg_rom_u16(image + HEAD(gain_q12) + j, space) && sg_rom_u16(image + HEAD(offset) + j, space);
+    return idle;
+}
+
 static int check_guards(const uint8_t *image, uint8_t guards, uint8_t channels, uint8_t space)
 {
     const uint8_t *guard = image + TRUST(guard);
@@ -97,7 +104,14 @@ static int check_guards(const uint8_t *image, uint8_t guards, uint8_t channels, 
         const uint16_t high = sg_rom_u16(guard + GUARD(high), space);
         if (sg_q_signed16(low) > sg_q_signed16(high))
             return SG_E_BOUNDS;
-        if (!within(sg_rom_u16(guard + GUARD(base), space), -16384, 16384))
+        if (!within(sg_rom_u16(guard + GUARD(base), space), -14336, 14336))
+            return SG_E_BOUNDS;
+        uint16_t size = 0;
+        for (uint8_t j = 0; j < SG_MODEL_CHANNELS; j++) {
+            const uint8_t entry = sg_rom_byte(guard + GUARD(row) + j, space);
+            size = (uint16_t)(size + (entry < 128 ? entry : 256U - entry));
+        }
+        if (size > 63)
             return SG_E_BOUNDS;
         if (any_bit(guard + GUARD(row) + channels, (uint8_t)(SG_MODEL_CHANNELS - channels), space))
             return SG_E_BOUNDS;
@@ -111,14 +125,12 @@ static int check_grid(const uint8_t *image, uint16_t bytes, uint8_t guards, uint
     for (uint8_t i = 0; i < 2; i++) {
         if (!within(sg_rom_u16(image + TRUST(origin_deg_q7) + 2U * i, space), -16384, 16384))
             return SG_E_BOUNDS;
-        if (bytes && !sg_rom_byte(image + TRUST(scale) + i, space))
+        if (!sg_rom_byte(image + TRUST(scale) + i, space))
             return SG_E_BOUNDS;
     }
     const uint8_t *node = image + SG_MODEL_HEAD_BYTES;
     for (; bytes != 0; bytes -= SG_MODEL_NODE_BYTES, node += SG_MODEL_NODE_BYTES) {
         if (any_bit(node + guards, (uint8_t)(SG_MODEL_GUARDS - guards), space))
-            return SG_E_BOUNDS;
-        if (!sg_rom_byte(node + SG_MODEL_GUARDS, space))
             return SG_E_BOUNDS;
     }
     return SG_OK;
@@ -168,7 +180,7 @@ int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint
     if (any_bit(image + HEAD(pad), sizeof(struct sg_model_head) - HEAD(pad), space)
         || any_bit(image + TRUST(pad), SG_MODEL_HEAD_BYTES - TRUST(pad), space))
         return SG_E_BOUNDS;
-    if (unused_channel_bits(image, channels, space))
+    if (unused_channel_bits(image, channels, space) || idle_offset(image, space))
         return SG_E_BOUNDS;
     int verdict = check_guards(image, guards, channels, space);
     if (verdict == SG_OK)

@@ -21,7 +21,7 @@
 //
 // Trust: is there a gaze that explains these features? With g guards and the gaze (azimuth, elevation; Q8.7,
 // before recentring) of above, the grid tells what each guard's projection should be there:
-//   p_k  = (sum_j row_kj * s_j) >> 8                                   flagged unless low_k <= p_k <= high_k
+//   p_k  = sum_j row_kj * (s_j >> 4)                                   flagged unless low_k <= p_k <= high_k
 //   t    = clamp(((gaze - origin) * scale), 0, (nodes - 1) * 65536 - 1) in each axis; cell t >> 16
 //   f    = (t >> 9) & 127;  w11 = (f_az * f_el) >> 7, w10 = f_az - w11, w01 = f_el - w11, w00 = 128 - f_az - w01
 //   r_k  = clamp(p_k - base_k - ((sum of w * expected_k over the cell's corners) >> 4), -127, 127)
@@ -29,6 +29,7 @@
 //   sigma_log2_q4 = min(255, ((sum of w * sigma_log2_q4 over the corners) >> 7) + ((m * sigma_gain) >> 12))
 // Rows are scaled so that 16 is one standard deviation of r_k in the calibration: m / 256 is a squared
 // Mahalanobis distance from the surface of features that gaze can make. A flagged point has sigma 255.
+// The sum over j of |row_kj| is at most 63, so that everything fits 16 bits.
 #ifndef SG_MODEL_H
 #define SG_MODEL_H
 
@@ -47,7 +48,7 @@ enum sg_model_limits {
     SG_MODEL_GUARDS = 4,
     SG_MODEL_NODES_MAX = 24,        // of the grid, along one axis
     SG_MODEL_SLOT_BYTES = 3072,
-    SG_MODEL_VECTORS_MAX = 234,     // (3072 - 256) / 12
+    SG_MODEL_VECTORS_MAX = 233,     // (3072 - 256 - 20) / 12
 };
 enum sg_model_kernel { SG_KERNEL_RBF = 0 };
 
@@ -60,7 +61,7 @@ struct sg_model_head {
     int32_t bias[2];                // azimuth, elevation; unit 2^-(weight_frac_bits + 12) deg, within +-2^30
     int16_t trend[2][6];            // per output and channel, same unit per step of s_j
     uint16_t offset[6];             // feature units
-    uint16_t gain_q12[6];           // s steps per feature step, Q4.12; 0 drops the channel
+    uint16_t gain_q12[6];           // s steps per feature step, Q4.12; 0 drops the channel, its offset is 0 too
     uint16_t version;               // SG_MODEL_VERSION
     uint8_t vectors;                // n, 1..SG_MODEL_VECTORS_MAX
     uint8_t channels;               // d, 1..6; channels >= d have gain 0 and zero centres
@@ -71,7 +72,7 @@ struct sg_model_head {
 
 // A direction in feature space in which gaze says what to expect. 12 bytes.
 struct sg_model_guard {
-    int16_t base;                   // of the expectation, +-16384
+    int16_t base;                   // of the expectation, +-14336
     int16_t low;                    // range of the projection
     int16_t high;
     int8_t row[6];
@@ -83,14 +84,14 @@ struct sg_model_trust {
     int16_t origin_deg_q7[2];       // gaze of the grid's first node: azimuth, elevation; Q8.7, +-16384
     uint16_t limit;                 // of m
     uint8_t scale[2];               // cells per 512 deg, at least 1
-    uint8_t nodes[2];               // of the grid: azimuth, elevation; 2..SG_MODEL_NODES_MAX, or both 0: no grid
+    uint8_t nodes[2];               // of the grid: azimuth, elevation; 2..SG_MODEL_NODES_MAX
     uint8_t guards;                 // in use, 0..4
     uint8_t sigma_gain;
     uint8_t pad[68];                // zero
 };
 
 // Grid: nodes[0] * nodes[1] nodes, azimuth first: expected projection per guard (u8[4], unit 8 of p_k; 0 for
-// guards not in use), sigma_log2_q4 (u8, at least 1): 5 bytes.
+// guards not in use), sigma_log2_q4 (u8; 0 throughout: unknown): 5 bytes.
 //
 // One calibration vector: half_c2 (u16), c[6] (u8), weight azimuth, elevation (s16): 12 bytes.
 
@@ -127,8 +128,8 @@ uint32_t sg_model_crc32_at(uint32_t crc, const uint8_t *data, uint16_t n, uint8_
 // the length against vectors, grid, slot (SG_E_BOUNDS) and room (SG_E_SHORT), the CRC (SG_E_CRC), then
 // SG_E_BOUNDS for: channels, kernel, weight_frac_bits, bias, guards, nodes, origin, scale or base outside
 // their ranges; a channel >= d with an offset, gain, trend, guard row entry or centre that is not 0; a guard
-// with low > high; a guard not in use, an expectation without guard or a pad byte that is not 0; a sigma of
-// 0; a half_c2 that is not that of its centre. sg_gp relies on all of it.
+// with low > high or too large a row; a guard not in use, an expectation without guard or a pad byte that is not 0; an offset
+// without gain; a half_c2 that is not that of its centre. sg_gp relies on all of it.
 // Cost      one pass for the CRC, one over the grid and the records; on AVR about 50 cycles per byte.
 // Returns   SG_OK or one of the errors above.
 int sg_model_open(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space);
@@ -140,7 +141,7 @@ int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint
 
 // The length an image claims, for a caller that computes the CRC in pieces: header checks up to SG_E_SHORT as
 // above.
-// Returns the length in bytes, 268..3072, or the error.
+// Returns the length in bytes, 288..3072, or the error.
 int sg_model_length(const uint8_t *image, uint32_t room, uint8_t space);
 // cdef end
 

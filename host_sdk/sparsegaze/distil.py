@@ -253,16 +253,16 @@ def guards(features, offset, gain, noise):
     for direction in directions.T[:GUARDS]:  # least variance first: gaze does not move these
         direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
         row = np.zeros(s.shape[1], np.int64)
-        row[live] = np.rint(127.0 * direction / np.abs(direction).max())
-        projection = s @ row >> 8
+        row[live] = np.trunc(63.0 * direction / np.abs(direction).sum())
+        projection = (s >> 4) @ row
         least, most = np.quantile(projection, [TAIL, 1 - TAIL])
-        spread = float(np.sqrt(row[live] ** 2 @ step_noise**2)) / 256
+        spread = float(np.sqrt(row[live] ** 2 @ step_noise**2)) / 16
         margin = max(GUARD_MARGIN * (most - least), GUARD_SIGMAS * spread)
         rows.append(row)
         low.append(int(np.floor(least - margin)))
         high.append(int(np.ceil(most + margin)))
     none = np.zeros(len(rows), np.int64)
-    return Trust(np.array(rows), none, np.array(low), np.array(high), np.zeros((0, 0, len(rows)), np.int64))
+    return Trust(np.array(rows), none, np.array(low), np.array(high), np.zeros((2, 2, len(rows)), np.int64), limit=65535)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ HEAD_BYTES = 2 * PAGE_BYTES
 RECORD_BYTES = 12
 CHANNELS = 6
 SLOT_BYTES = 3072
-VECTORS_MAX = (SLOT_BYTES - HEAD_BYTES) // RECORD_BYTES
+VECTORS_MAX = (SLOT_BYTES - HEAD_BYTES - 20) // RECORD_BYTES  # beside the least grid
 WEIGHT_FRAC_BITS = range(5, 10)
 BIAS_MAX = 1 << 30
 KERNEL_RBF = 0
@@ -378,7 +378,7 @@ def _checked(image):
         or head["weight_frac_bits"] not in WEIGHT_FRAC_BITS
         or np.any(np.abs(head["bias"].astype(np.int64)) > BIAS_MAX)
         or np.any(head["pad"])
-        or np.any(head["offset"][unused])
+        or np.any(head["offset"][head["gain_q12"] == 0])
         or np.any(head["gain_q12"][unused])
         or np.any(head["trend"][:, unused])
         or np.any(records["c"][:, unused])

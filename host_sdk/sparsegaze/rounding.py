@@ -109,8 +109,8 @@ def _slabs(rails, live):
     rows, low, high = [], [], []
     for row, least, most in zip(rails.row[:, live].astype(float), rails.low, rails.high):
         rows.append(row)
-        low.append(256.0 * least)
-        high.append(256.0 * (most + 1))
+        low.append(16.0 * least - 15.0 * np.maximum(-row, 0).sum())
+        high.append(16.0 * most + 15.0 * np.maximum(row, 0).sum())
     for _ in range(d - len(rows)):
         free = np.eye(d)
         if rows:

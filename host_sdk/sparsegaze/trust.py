@@ -17,7 +17,7 @@ PAGE_BYTES = 128
 RESIDUAL_SD = 16  # steps of a guard's residual that are one standard deviation
 DOUBT_UNIT = RESIDUAL_SD**2
 SIGMA_HUGE = 255
-REACH_MAX = 1 << 14  # of an origin and of a base
+ORIGIN_MAX, BASE_MAX, ROW_MAX = 1 << 14, 14336, 63  # ROW_MAX: sum of magnitudes
 
 GUARD = np.dtype([("base", "<i2"), ("low", "<i2"), ("high", "<i2"), ("row", "i1", (CHANNELS,))])
 PAGE = np.dtype(
@@ -40,10 +40,10 @@ def _none(*shape):
 
 @dataclass(frozen=True)
 class Trust:
-    """Guards and grid, integers as stored; without arguments: none.
+    """Guards and grid, integers as stored; without arguments: no guards, sigma unknown.
 
     row [g, d], base, low, high [g]; g of 0..4
-    expected [nodes elevation, nodes azimuth, g] 0..255, sigma [nodes elevation, nodes azimuth] codes 1..254
+    expected [nodes elevation, nodes azimuth, g] 0..255, sigma [nodes elevation, nodes azimuth] codes 0..255
     origin_deg_q7 [2], scale [2] (azimuth, elevation), limit of m, sigma_gain
     """
 
@@ -51,10 +51,10 @@ class Trust:
     base: np.ndarray = _none(0)
     low: np.ndarray = _none(0)
     high: np.ndarray = _none(0)
-    expected: np.ndarray = _none(0, 0, 0)
-    sigma: np.ndarray = _none(0, 0)
+    expected: np.ndarray = _none(2, 2, 0)
+    sigma: np.ndarray = _none(2, 2)
     origin_deg_q7: np.ndarray = _none(2)
-    scale: np.ndarray = _none(2)
+    scale: np.ndarray = field(default_factory=lambda: np.ones(2, np.int64))
     limit: int = 65535
     sigma_gain: int = 0
 
@@ -79,9 +79,8 @@ class Trust:
         for name in ("limit", "guards", "sigma_gain"):
             put(page, name, getattr(self, name), ())
         grid = np.zeros(self.sigma.size, [("expected", "u1", (GUARDS,)), ("sigma", "u1")])
-        if len(grid):
-            put(grid, "expected", np.asarray(self.expected).reshape(len(grid), g), (len(grid), g))
-            put(grid, "sigma", np.asarray(self.sigma).reshape(-1), (len(grid),))
+        put(grid, "expected", np.asarray(self.expected).reshape(len(grid), g), (len(grid), g))
+        put(grid, "sigma", np.asarray(self.sigma).reshape(-1), (len(grid),))
         return page.tobytes(), grid.tobytes()
 
     @classmethod
@@ -113,16 +112,16 @@ class Trust:
             return False
         node = np.frombuffer(data, np.uint8, self.sigma.size * NODE_BYTES, PAGE_BYTES).reshape(-1, NODE_BYTES)
         return not (
-            1 in self.sigma.shape
+            min(self.sigma.shape) < 2
             or np.any(page["pad"])
             or page["guard"][self.guards :].tobytes().strip(b"\0")
             or np.any(self.low > self.high)
-            or np.any(np.abs(self.base) > REACH_MAX)
+            or np.any(np.abs(self.base) > BASE_MAX)
+            or np.any(np.abs(self.row).sum(axis=1) > ROW_MAX)
             or np.any(self.row[:, channels:])
-            or np.any(np.abs(self.origin_deg_q7) > REACH_MAX)
-            or (node.size and np.any(self.scale == 0))
+            or np.any(np.abs(self.origin_deg_q7) > ORIGIN_MAX)
+            or np.any(self.scale == 0)
             or np.any(node[:, self.guards : GUARDS])
-            or np.any(node[:, GUARDS] == 0)
         )
 
     def judge(self, s, gaze_q7, outside):
@@ -132,17 +131,12 @@ class Trust:
         """
         row = np.zeros((self.guards, s.shape[1]), np.int64)
         row[:, : self.row.shape[1]] = self.row
-        projection = s @ row.T >> 8
+        projection = (s >> 4) @ row.T
         outside = outside | np.any((projection < self.low) | (projection > self.high), axis=1)
-        miss = projection - self.base
-        if self.sigma.size:
-            expected, sigma = self._at(gaze_q7)
-            miss = miss - (expected >> 4)
-        miss = np.clip(miss, -127, 127)
+        expected, sigma = self._at(gaze_q7)
+        miss = np.clip(projection - self.base - (expected >> 4), -127, 127)
         doubt = np.sum(miss * miss, axis=1)
         outside = outside | (doubt > self.limit)
-        if not self.sigma.size:
-            return outside, doubt, np.zeros(len(s), np.int64)
         code = (sigma >> 7) + (doubt * self.sigma_gain >> 12)
         return outside, doubt, np.where(outside, SIGMA_HUGE, np.minimum(code, SIGMA_HUGE))
 

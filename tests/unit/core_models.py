@@ -24,13 +24,19 @@ class Parts:
     weight: np.ndarray          # [n, 2]
     weight_frac_bits: int = 9
     guard: list = field(default_factory=list)       # (base, low, high, row [d])
-    expected: np.ndarray = None                     # [high, wide, g]; None: no grid
-    sigma: np.ndarray = None                        # [high, wide]
+    expected: np.ndarray = None                     # [high, wide, g]; None: 0
+    sigma: np.ndarray = None                        # [high, wide]; None: 0
     origin: tuple = (-2560, -2560)
     scale: tuple = (64, 64)
     limit: int = 65535
     sigma_gain: int = 0
     generation: int = 1
+
+    def __post_init__(self):
+        if self.sigma is None:
+            self.sigma = np.zeros((2, 2), np.int64)
+        if self.expected is None:
+            self.expected = np.zeros((*self.sigma.shape, len(self.guard)), np.int64)
 
     @property
     def d(self):
@@ -48,10 +54,9 @@ class Parts:
         head, page = ffi.new("struct sg_model_head *"), ffi.new("struct sg_model_trust *")
         head.magic, head.version, head.vectors, head.channels = lib.SG_MODEL_MAGIC, 2, n, d
         grid = b""
-        if self.sigma is not None:
-            page.nodes = [self.sigma.shape[1], self.sigma.shape[0]]
-            for sigma, expected in zip(self.sigma.ravel(), self.expected.reshape(self.sigma.size, len(self.guard))):
-                grid += bytes(int(v) for v in expected) + bytes(4 - len(self.guard)) + bytes([int(sigma)])
+        page.nodes = [self.sigma.shape[1], self.sigma.shape[0]]
+        for sigma, expected in zip(self.sigma.ravel(), self.expected.reshape(self.sigma.size, len(self.guard))):
+            grid += bytes(int(v) for v in expected) + bytes(4 - len(self.guard)) + bytes([int(sigma)])
         head.generation, head.length = self.generation, 256 + len(grid) + 12 * n
         head.weight_frac_bits = self.weight_frac_bits
         head.bias = [int(v) for v in self.bias]
@@ -80,13 +85,12 @@ def seal(image):
 def random_parts(rng, n, d=6, guards=3, grid=(5, 4), **more):
     """A model whose every field is drawn over most of its range, but whose features are not all clamped.
 
-    guards 0..4; grid (high, wide), or None."""
+    guards 0..4; grid (high, wide)."""
     centre = rng.integers(0, 256, (n, d))
-    row = [rng.integers(-128, 128, d) for _ in range(guards)]
-    if grid:
-        more.setdefault("expected", rng.integers(0, 256, (*grid, guards)))
-        more.setdefault("sigma", rng.integers(1, 200, grid))
-        more.setdefault("sigma_gain", 3)
+    row = [rng.integers(-10, 11, d) for _ in range(guards)]
+    more.setdefault("expected", rng.integers(0, 256, (*grid, guards)))
+    more.setdefault("sigma", rng.integers(1, 200, grid))
+    more.setdefault("sigma_gain", 3)
     return Parts(offset=rng.integers(0, 40000, d), gain_q12=rng.integers(300, 3000, d),
                  bias=rng.integers(-2 ** 22, 2 ** 22, 2), trend=rng.integers(-300, 300, (2, d)),
                  centre=centre, weight=rng.integers(-32768, 32768, (n, 2)),
@@ -128,24 +132,20 @@ def twin(parts, feature):
     acc = (acc + 2 ** 23) % 2 ** 24 - 2 ** 23
     shift = parts.weight_frac_bits + 1
     deg = (acc + (1 << (shift - 1))) >> shift
-    nodes, total = _corners(parts, np.clip(deg, -32768, 32767))
+    total = _corners(parts, np.clip(deg, -32768, 32767))
     doubt = np.zeros(len(s), np.int64)
     for i, (base, low, high, row) in enumerate(parts.guard):
-        p = (s @ np.asarray(row, np.int64)) >> 8
+        p = (s >> 4) @ np.asarray(row, np.int64)
         outside |= (p < low) | (p > high)
-        r = p - base - (total(parts.expected[..., i]) >> 4 if nodes else 0)
+        r = p - base - (total(parts.expected[..., i]) >> 4)
         doubt += np.clip(r, -127, 127) ** 2
     outside |= doubt > parts.limit
-    sigma = np.zeros(len(s), np.int64)
-    if nodes:
-        sigma = np.minimum(255, (total(parts.sigma) >> 7) + ((doubt * parts.sigma_gain) >> 12))
-    return deg, outside, doubt, np.where(outside & bool(nodes), 255, sigma)
+    sigma = np.minimum(255, (total(parts.sigma) >> 7) + ((doubt * parts.sigma_gain) >> 12))
+    return deg, outside, doubt, np.where(outside, 255, sigma)
 
 
 def _corners(parts, deg):
-    """(number of nodes, function: node values [high, wide] -> 128 times their blend at deg [count, 2])."""
-    if parts.sigma is None:
-        return 0, None
+    """Function: node values [high, wide] -> 128 times their blend at deg [count, 2]."""
     cell, f = [], []
     for axis in range(2):
         most = (parts.sigma.shape[1 - axis] - 1) * 65536 - 1
@@ -160,7 +160,7 @@ def _corners(parts, deg):
         x, y = cell
         return w00 * node[y, x] + w10 * node[y, x + 1] + w01 * node[y + 1, x] + w11 * node[y + 1, x + 1]
 
-    return parts.sigma.size, total
+    return total
 
 
 def real_mean_deg(parts, feature):

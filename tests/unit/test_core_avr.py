@@ -102,9 +102,9 @@ def test_extremes_of_the_distance_and_of_every_operand_are_bit_identical(bench_d
     parts = Parts(offset=np.zeros(6, int), gain_q12=np.full(6, 4096), bias=np.array([2 ** 30, -2 ** 30]),
                   trend=np.array([[32767, -32768, -1, 1, 255, -256]] * 2), centre=np.array(rows),
                   weight=np.array(weights), weight_frac_bits=5,
-                  guard=[(-16384, -2 ** 15, 2 ** 15 - 1, np.array([-128, 127, -1, 1, 0, -128])),
-                         (16384, -12 * 10 ** 3, 4 * 10 ** 3, np.full(6, -128)),
-                         (0, -2 ** 15, 2 ** 15 - 1, np.zeros(6, int)), (3, -4, 5, np.full(6, 127))],
+                  guard=[(-14336, -2 ** 15, 2 ** 15 - 1, np.array([-12, 17, -1, 1, 0, -32])),
+                         (14336, -12 * 10 ** 3, 4 * 10 ** 3, np.array([-63, 0, 0, 0, 0, 0])),
+                         (0, -2 ** 15, 2 ** 15 - 1, np.zeros(6, int)), (3, -4, 5, np.array([0, 0, 63, 0, 0, 0]))],
                   expected=np.arange(20 * 20 * 4).reshape(20, 20, 4) % 256,
                   sigma=1 + np.arange(20 * 20).reshape(20, 20) % 255, origin=(-16384, 16384), scale=(255, 1),
                   limit=64515, sigma_gain=255)
@@ -120,7 +120,7 @@ def test_cycles_at_64_vectors(bench_dir, twin):
                   bias=rng.integers(-2 ** 27, 2 ** 27, 2),
                   trend=rng.integers(-9000, 9000, (2, 6)), centre=rng.integers(98, 103, (64, 6)),
                   weight=rng.integers(-32768, 32768, (64, 2)),
-                  guard=[(0, -2 ** 15, 2 ** 15 - 1, rng.integers(-128, 128, 6)) for _ in range(4)],
+                  guard=[(0, -2 ** 15, 2 ** 15 - 1, rng.integers(-10, 11, 6)) for _ in range(4)],
                   expected=rng.integers(0, 256, (9, 9, 4)), sigma=rng.integers(1, 200, (9, 9)))
     feature = (20000 + 1600 * 4096 // 1500 + rng.integers(0, 40, (20, 6))).astype(np.uint16)
     cycles = run(bench_dir, parts, feature, twin).cycles
