@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Cholesky factor of a covariance matrix: jitter, condition, inverse, and the repair of a matrix that is none."""
+"""The Cholesky factor of a covariance matrix: jitter, condition number, inverse, residual."""
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, eigh, lapack, svdvals
+from scipy.linalg import cho_factor, cho_solve, lapack, svdvals
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from .errors import CalibrationError
@@ -11,7 +11,6 @@ JITTERS = (0.0, 1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7, 1e-6)  # relative to the 
 EPS = float(np.finfo(float).eps)
 CONDITION_MOST = 0.1 / EPS  # 4.5e14: beyond it the least eigenvalue is within ten roundings of the largest
 DENSE_MOST = 800  # rows up to which singular values are computed outright
-RANK_TOLERANCE = 1e-12  # of the largest eigenvalue: smaller ones are removed by a repair
 
 
 def cholesky(cov, jitters=JITTERS):
@@ -65,34 +64,26 @@ def extremes(factor):
     return float(singular[0] ** 2), float(max(singular[-1] ** 2, np.finfo(float).tiny))
 
 
-def repaired(matrix):
-    """The covariance matrix nearest to a symmetric matrix: (repaired [n, n], eigenvalues [n], vectors [n, n]).
+def leftover(cov, jitter, alpha, target, entries, lost):
+    """Bound of what alpha [n, o] leaves of (K + jitter mean diagonal) alpha = target, K exact: [n, o].
 
-    Eigenvalues below RANK_TOLERANCE of the largest are set to 0: the nearest positive semidefinite matrix in the
-    Frobenius norm (Higham 1988).
+    The residual of the stored matrix, accumulated in extended precision where there is one, and what rounding of
+    its entries adds: eps (g |entry| + h), entries = (g, h); and `lost` per root-mean-square weight.
+
+    A mean k(x, X) alpha + h(x) b is off by w' r + m' t: r this, t what is left of H' alpha = 0, w the weights of
+    the data in the mean at x, m the multipliers of its columns. Exact, but for w and m, which are computed.
     """
-    values, vectors = eigh(matrix, check_finite=False)
-    kept = vectors[:, values > RANK_TOLERANCE * values[-1]]
-    result = (kept * values[-kept.shape[1] :]) @ kept.T
-    return 0.5 * (result + result.T), values, vectors
-
-
-def repaired_slope(slope, values, vectors):
-    """Derivative in the matrix, given the derivative `slope` in the repaired one (Loewner's divided differences)."""
-    after = np.where(values > RANK_TOLERANCE * values[-1], values, 0.0)
-    gap = values[:, None] - values
-    same = np.abs(gap) <= 1e-14 * values[-1]
-    ratio = np.where(same, 0.0, after[:, None] - after) / np.where(same, 1.0, gap)
-    ratio = np.where(same, ((after[:, None] > 0) & (after > 0)).astype(float), ratio)
-    return vectors @ (ratio * (vectors.T @ slope @ vectors)) @ vectors.T
-
-
-def residual(cov, jitter, alpha, target):
-    """target - (cov + jitter mean diagonal) alpha, accumulated in extended precision where there is one: [n, o]."""
-    weights = alpha.astype(np.longdouble)
+    weights, size = alpha.astype(np.longdouble), np.abs(alpha)
     extra = jitter * float(np.mean(np.diag(cov)))
     out = np.empty(alpha.shape)
     for start in range(0, len(cov), 256):
         rows = slice(start, start + 256)
         out[rows] = target[rows] - cov[rows].astype(np.longdouble) @ weights - extra * weights[rows]
-    return out
+    spread = entries[0] * (np.abs(cov) @ size) + entries[1] * size.sum(axis=0)
+    return np.abs(out) + EPS * spread + lost * np.sqrt(np.mean(size**2, axis=0))
+
+
+def last_sum(cov, alpha, entries):
+    """Bound of the rounding of sum_i k(x, x_i) alpha_i itself, at places whose kernels are like the data's: [o]."""
+    size = np.abs(alpha)
+    return EPS * ((entries[0] + len(size)) * (np.abs(cov) @ size).max(axis=0) + entries[1] * size.sum(axis=0))

@@ -19,31 +19,20 @@ from scipy.linalg import solve_triangular
 from threadpoolctl import ThreadpoolController
 
 from .errors import CalibrationError
-from .factor import CONDITION_MOST, EPS, JITTERS, RANK_TOLERANCE, cholesky, extremes, inverse, repaired, residual
+from .factor import CONDITION_MOST, EPS, JITTERS, cholesky, extremes, inverse, last_sum, leftover
+from .hyper import Hyper, gap, learnt, refined
 from .kernels import Kernel
 from .kernels import kernel as make_kernel
-from .likelihood import LENGTH_RANGE, Likelihood, learn, thorough
+from .likelihood import LENGTH_RANGE
+from .repair import Repair
 from .samples import Samples, spread
 
 LEARN_ROWS = 600  # rows of the likelihood that is searched from several starts
 ROWS_MAX = 3000  # of the process: 9e6 entries, 72 MB a matrix
 ROUNDING_MOST_DEG = 0.01  # proven error of a prediction by rounding; more jitter is added until it is below
+REPAIR_MISS_MOST = 1.7  # median of error over claim for samples left out; 0.83 is what a claim that is right has
 PROBES = 200  # of the rows, and as many places between them, where the error by rounding is bounded
 _blas = ThreadpoolController()
-
-
-@dataclass(frozen=True)
-class Hyper:
-    """Kernel parameters in the units of the data.
-
-    length [d] in the kernel's length unit: feature units, but for canberra (a pure number) and cosine (rad, the
-    same in all channels); inf drops a channel. signal_deg, noise_deg, group_deg standard deviations
-    """
-
-    length: np.ndarray
-    signal_deg: float
-    noise_deg: float
-    group_deg: float = 0.0
 
 
 @dataclass
@@ -81,7 +70,7 @@ class GaussianProcess:
     length_max: float = LENGTH_RANGE[1]
     _factor: object = field(default=None, repr=False)
     _origin: np.ndarray = field(default=None, repr=False)
-    _spectrum: tuple = field(default=None, repr=False)
+    _repair: Repair = field(default=None, repr=False)
 
     @classmethod
     @_blas.wrap(limits=1, user_api="blas")
@@ -103,15 +92,18 @@ class GaussianProcess:
         noise_free=False,
         learn_rows=LEARN_ROWS,
         rows_max=ROWS_MAX,
+        refine=False,
     ):
         """Fit to features [n, d] and gaze_deg [n, 2].
 
         noise_scale   [n] relative noise variance of each sample (default 1)
         groups        int [n], samples that share one error; used when group_noise, or hyper.group_deg > 0
-        hyper         use these parameters instead of optimising the likelihood
+        hyper         use these parameters instead of optimising the likelihood; with refine start from them, and
+                      take a few steps to its maximum (at most 14 evaluations on at most 2000 rows)
         length_max    longest length scale, in standard deviations of the channel
         restarts      random starting points beside the standard one, drawn from the seed
-        kernel, p, exponent  see kernels.kernel;  noise_free  the paper's form, noise_deg = 0
+        kernel, p, exponent  see kernels.kernel
+        noise_free    learn the paper's form, noise_deg = 0 (with hyper its noise_deg decides)
         learn_rows    above it the likelihood is searched on that many rows, then polished on up to 2000
         rows_max      above it the process keeps that many rows, evenly spread, and warns
         The result is a pure function of data and seed; samples are put in a canonical order first.
@@ -124,7 +116,11 @@ class GaussianProcess:
         gp.rows_given, gp.length_max = known.given, length_max
         gp.noise_free = noise_free if hyper is None else hyper.noise_deg == 0
         if hyper is None:
-            gp.hyper = gp._learn(restarts, seed, group_noise, learn_rows)
+            gp.hyper = learnt(gp, restarts, seed, group_noise, learn_rows)
+        else:
+            gp.hyper = hyper.checked(gp.x.shape[1], known.dropped)
+            if refine:
+                gp.hyper = refined(gp, learn_rows)
         gp._solve()
         return gp
 
@@ -160,7 +156,7 @@ class GaussianProcess:
         """
         features = self._query(features)
         out = np.zeros((len(features), 2, features.shape[1]))
-        used, own, length = np.isfinite(self.hyper.length), self._kept(self.x), self._lengths()
+        used, own, length = self.hyper.used, self._kept(self.x), self.hyper.lengths(self.kernel)
         for rows in _blocks(len(features), len(self.x)):
             part = self.kernel.slope(self._kept(features[rows]), own, length, self.alpha)
             out[rows][:, :, used] = self.hyper.signal_deg**2 * part
@@ -196,12 +192,7 @@ class GaussianProcess:
         For a report, not for use: minutes at 2000 rows. The searches run on a part of the rows; the best three
         and the parameters in use are then followed to convergence on up to 2000 of them.
         """
-        grouped = self.hyper.group_deg > 0
-        problem, level, unit = self._problem(grouped)
-        deviations = [self.hyper.signal_deg, self.hyper.noise_deg, self.hyper.group_deg]
-        used = [True, not self.noise_free, grouped]
-        here = np.log(np.r_[self._lengths() / unit, np.array(deviations)[used] / level])
-        return thorough(problem, here, self.length_max, restarts, seed)
+        return gap(self, restarts, seed)
 
     def describe(self):
         """The process in a dict that JSON can hold: kernel, hyper-parameters, fit, and what was done to the matrix."""
@@ -213,7 +204,7 @@ class GaussianProcess:
             "kernel": self.kernel.name,
             "formula": f"{self.hyper.signal_deg:.6g}^2 {self.kernel.formula()}",
             "p": None if not named else "inf" if np.isinf(self.kernel.p) else float(self.kernel.p),
-            "positive_definite": bool(self.kernel.definite(int(np.isfinite(self.hyper.length).sum()))),
+            "positive_definite": bool(self.kernel.definite(int(self.hyper.used.sum()))),
             "length": [float(v) if np.isfinite(v) else None for v in self.hyper.length],
             "length_unit": self.kernel.length_unit,
             "signal_deg": float(self.hyper.signal_deg),
@@ -249,29 +240,16 @@ class GaussianProcess:
 
     def _kept(self, features):
         """The channels that the kernel uses, as an array of its own."""
-        return np.ascontiguousarray(features[:, np.isfinite(self.hyper.length)])
-
-    def _lengths(self):
-        kept = self.hyper.length[np.isfinite(self.hyper.length)]
-        return kept if self.kernel.per_channel else kept[:1]
+        return np.ascontiguousarray(features[:, self.hyper.used])
 
     def _kernel(self, features):
-        value = self.kernel.value(self._kept(features), self._kept(self.x), self._lengths())
+        value = self.kernel.value(self._kept(features), self._kept(self.x), self.hyper.lengths(self.kernel))
         return self.hyper.signal_deg**2 * value
 
     def _sound(self, k):
-        """Covariances [m, n] with the data, and variances [m], of the process; k from `_kernel`.
-
-        A repaired process is the one whose covariance is k(x, X) K+^-1 k(X, x'), K+ the repaired matrix on its
-        range (Nystroem's extension), plus what of s^2 that leaves out, as noise of its own at each point. It is
-        positive definite everywhere and equals K+ on the data, so that a variance cannot be negative.
-        """
+        """Covariances [m, n] with the data, and variances, of the process that is solved; k from `_kernel`."""
         s2 = self.hyper.signal_deg**2
-        if self._spectrum is None:
-            return k, s2
-        values, vectors = self._spectrum
-        along = k @ vectors
-        return along @ vectors.T, np.maximum(s2, np.sum(along * along / values, axis=1))
+        return (k, s2) if self._repair is None else self._repair.extend(k, s2)
 
     def _basis(self, features):
         if self.mean == "zero":
@@ -290,31 +268,7 @@ class GaussianProcess:
             p = p - q.T @ q
         return p
 
-    def _problem(self, group_noise):
-        """(Likelihood of the data, level [deg] of its gaze, natural units [L] in the hyper-parameters' units)."""
-        live = [j for j in range(self.x.shape[1]) if j not in self.dropped]
-        z, unit, in_features = self.kernel.natural(self.x[:, live])
-        level = float(np.sqrt(np.mean((self.y - self.y.mean(axis=0)) ** 2))) or 1.0
-        one = np.ones((len(z), 1))
-        x = self.x[:, live]
-        h = {"zero": lambda: one[:, :0], "constant": lambda: one}.get(
-            self.mean, lambda: np.hstack([one, (x - x.mean(axis=0)) / x.std(axis=0)])
-        )()
-        scale, groups = self.noise_scale, self.groups
-        args = self.kernel, z, unit, self.y / level, h, scale, groups, self.noise_free, group_noise
-        return Likelihood(*args), level, in_features
-
-    def _learn(self, restarts, seed, group_noise, learn_rows):
-        problem, level, unit = self._problem(group_noise)
-        theta = learn(problem, self.length_max, restarts, seed, learn_rows)
-        value = np.exp(theta)
-        length = np.full(self.x.shape[1], np.inf)
-        length[[j for j in range(len(length)) if j not in self.dropped]] = value[: len(unit)] * unit
-        rest = [float(v * level) for v in value[len(unit) :]]
-        noise = 0.0 if self.noise_free else rest[1]
-        return Hyper(length, rest[0], noise, rest[-1] if group_noise else 0.0)
-
-    def _solve(self):
+    def _solve(self, verify=True):
         x, hyper = self.x, self.hyper
         deviation = x.std(axis=0)
         deviation[list(self.dropped)] = 1.0
@@ -322,7 +276,7 @@ class GaussianProcess:
         cov = self._kernel(x)
         cov = 0.5 * (cov + cov.T)
         np.fill_diagonal(cov, hyper.signal_deg**2)
-        if not self.kernel.definite(int(np.isfinite(hyper.length).sum())):
+        if not self.kernel.definite(int(hyper.used.sum())):
             cov = self._repaired(cov)
         cov[np.diag_indices(len(x))] += hyper.noise_deg**2 * self.noise_scale
         if hyper.group_deg > 0:
@@ -345,6 +299,8 @@ class GaussianProcess:
                 f"the covariance matrix is singular to float64: noise of {self._jitter_deg():.2g} deg was added",
                 stacklevel=5,
             )
+        if verify and self.repair and self.repair["negative"]:
+            self._verify_repair()
 
     def _weigh(self, cov):
         """Weights, likelihood, condition and error bound, from the factor."""
@@ -369,55 +325,64 @@ class GaussianProcess:
         self.condition = largest / smallest
         lost = smallest <= 4 * EPS * largest  # no more than Cholesky's own rounding
         self.rounding_deg = np.inf if lost else self._rounding(cov, alpha, h)
-        self.alpha = alpha if self._spectrum is None else self._spectrum[1] @ (self._spectrum[1].T @ alpha)
+        self.alpha = alpha if self._repair is None else self._repair.project(alpha)
 
     def _rounding(self, cov, alpha, h):
-        """Bound of a prediction's error at the data and between them (PROBES places), degrees.
-
-        With r what the weights in use leave of the exact K a + H b = y, the kernel's own rounding included, and t
-        what they leave of H' a = 0, the mean at x is off by w' r + m' t: w are the weights of the data in the mean
-        at x, m the multipliers of its columns. Then the rounding of the last sum.
-        """
-        s2, size = self.hyper.signal_deg**2, np.abs(alpha)
-        relative, absolute = self.kernel.rounding(self._kept(self.x), self._lengths())
-        sums, total = np.abs(cov) @ size, size.sum(axis=0)
-        miss = np.abs(residual(cov, self.jitter, alpha, self.y - h @ self.beta))
-        miss += EPS * (relative * sums + absolute * s2 * total + 4 * np.abs(self.y))
-        if self._spectrum is not None:
-            miss += 30 * EPS * self._spectrum[0][-1] * np.sqrt(np.mean(size**2, axis=0))
+        """Bound of a prediction's error at the data and between them (PROBES places), degrees."""
         near = self.x[spread(len(self.x), PROBES)]
         probes = np.vstack([near, 0.5 * (near[1:] + near[:-1])])
+        s2 = self.hyper.signal_deg**2
+        relative, absolute = self.kernel.rounding(self._kept(self.x), self.hyper.lengths(self.kernel))
+        entries = relative, absolute * s2
+        lost = 30 * EPS * self._repair.values[-1] if self._repair else 0.0
+        miss = leftover(cov, self.jitter, alpha, self.y - h @ self.beta, entries, lost) + 4 * EPS * np.abs(self.y)
         v = solve_triangular(self._factor[0], self._sound(self._kernel(probes))[0].T, lower=True)
         off = np.zeros((len(probes), 2))
         if h.shape[1]:
             lack = solve_triangular(self._h_factor, self._basis(probes).T - self._h_white.T @ v, trans="T")
             multiplier = solve_triangular(self._h_factor, lack)
             v = v + self._h_white @ multiplier
-            off = np.abs(multiplier.T) @ (np.abs(h.T @ alpha) + len(h) * EPS * (np.abs(h.T) @ size))
+            off = np.abs(multiplier.T) @ (np.abs(h.T @ alpha) + len(h) * EPS * (np.abs(h.T) @ np.abs(alpha)))
         off += np.abs(solve_triangular(self._factor[0], v, lower=True, trans="T").T) @ miss
-        last = EPS * ((relative + len(size)) * sums.max(axis=0) + absolute * s2 * total)
-        return float(np.max(off + last) + 8 * EPS * np.abs(self.y).max())
+        return float(np.max(off + last_sum(cov, alpha, entries)) + 8 * EPS * np.abs(self.y).max())
 
     def _repaired(self, cov):
-        """cov made a covariance matrix; fills `repair` and the spectrum that predictions need."""
-        cov, values, vectors = repaired(cov)
-        kept = values > RANK_TOLERANCE * values[-1]
-        removed = float(np.abs(values[values < 0]).sum() / np.abs(values).sum())
-        least = float(values[0] / self.hyper.signal_deg**2)
-        self._spectrum = values[kept], vectors[:, kept]
-        negative = int((values < -EPS * len(values) * values[-1]).sum())
-        done = f"{negative} negative eigenvalues, {100 * removed:.2g} % of the spectrum, were removed"
+        """cov made a covariance matrix."""
+        self._repair = fix = Repair(cov)
+        done = f"{fix.negative} negative eigenvalues, {100 * fix.share:.2g} % of the spectrum, were removed"
         self.repair = {
             "words": f"the Minkowski distance of p = {self.kernel.p:g} gives no covariance in 3 or more channels: "
-            + (done if negative else "on these samples it happens to, nothing had to be removed"),
-            "negative": negative,
-            "smallest_eigenvalue": least,
-            "removed_share": removed,
-            "rank": int(kept.sum()),
+            + (done if fix.negative else "on these samples it happens to, nothing had to be removed"),
+            "negative": fix.negative,
+            "smallest_eigenvalue": fix.least / self.hyper.signal_deg**2,
+            "removed_share": fix.share,
+            "rank": len(fix.values),
         }
-        if negative:
-            warnings.warn(self.repair["words"], stacklevel=6)
-        return cov
+        return fix.matrix
+
+    def _verify_repair(self):
+        """Refuse a repair whose process misses what it has not seen by more than it says.
+
+        Leaving out in closed form cannot tell: the repaired matrix has seen the sample. So every eighth sample is
+        left out of matrix and repair.
+        """
+        out = np.arange(len(self.x)) % 8 == 3
+        known = [v[~out] for v in (self.x, self.y, self.noise_scale, self.groups)]
+        mean = "constant" if self.mean == "linear" else self.mean
+        part = GaussianProcess(*known[:2], self.hyper, mean, *known[2:], self.dropped, kernel=self.kernel)
+        part.noise_free = True  # no word about its jitter
+        part._solve(verify=False)
+        mean, std = part.predict(self.x[out], return_std=True)
+        miss = np.sqrt(np.mean((mean - self.y[out]) ** 2, axis=1))
+        said = np.sqrt(std**2 + self.hyper.noise_deg**2 * self.noise_scale[out] + self.hyper.group_deg**2)
+        self.repair |= {"held_out_deg": float(np.median(miss)), "claimed_deg": float(np.median(said))}
+        if np.median(miss / said) > REPAIR_MISS_MOST:
+            raise CalibrationError(
+                f"p = {self.kernel.p:g} cannot be repaired with these hyper-parameters: samples left out are missed by "
+                f"{np.median(miss):.2g} deg where the process claims {np.median(said):.2g}",
+                "use p of at most 2, or have the hyper-parameters learnt",
+            )
+        warnings.warn(self.repair["words"], stacklevel=5)
 
     def _jitter_deg(self):
         """Standard deviation of the noise that the jitter amounts to."""

@@ -12,7 +12,8 @@ from scipy.linalg import cho_solve, solve_triangular
 from scipy.optimize import minimize
 
 from .errors import CalibrationError
-from .factor import cholesky, inverse, repaired, repaired_slope
+from .factor import cholesky, inverse
+from .repair import Repair
 from .samples import spread
 
 LENGTH_RANGE = (0.05, 100.0)  # in natural units: standard deviations of the channel for most kernels
@@ -74,7 +75,8 @@ class Likelihood:
         kernel, signal2 = self.kernel, np.exp(2 * theta[lengths])
         u, c = self._distance(theta[:lengths])
         k = signal2 * kernel.shape(u)
-        cov, spectrum = (k.copy(), None) if self.sound else self._repaired(k)
+        repair = None if self.sound else Repair(0.5 * (k + k.T))
+        cov = k.copy() if self.sound else repair.matrix
         at = lengths + 1
         if self.noise_free:
             noise = np.full(n, JITTER_NOISE_FREE * signal2)
@@ -97,9 +99,9 @@ class Likelihood:
         value = -0.5 * np.sum(r * alpha) - 2 * np.sum(np.log(np.diag(factor[0]))) - n * np.log(2 * np.pi)
         m = alpha @ alpha.T - 2 * inverse(factor[0])
         slope = np.empty_like(theta)
-        mk = m if spectrum is None else repaired_slope(m, *spectrum)
-        slope[:lengths] = 0.5 * self._length_sums(mk * (signal2 * kernel.fall(u)), theta[:lengths], u, c)
-        slope[lengths] = np.sum(mk * k)
+        before = m if self.sound else repair.slope(m)
+        slope[:lengths] = 0.5 * self._length_sums(before * (signal2 * kernel.fall(u)), theta[:lengths], u, c)
+        slope[lengths] = np.sum(before * k)
         if self.noise_free:
             slope[lengths] += np.sum(np.diag(m) * noise)
         else:
@@ -118,11 +120,6 @@ class Likelihood:
         if c is None:
             return self.kernel.length_sums(weight, self.z, np.exp(log_length) * self.unit, u)
         return self.kernel.degree * c * [np.sum(weight * term) for term in self._stack]
-
-    @staticmethod
-    def _repaired(k):
-        cov, *spectrum = repaired(0.5 * (k + k.T))
-        return cov, spectrum
 
 
 def maximise(problem, starts, length_max, tight=False):
@@ -156,9 +153,16 @@ def learn(problem, length_max, restarts, seed, rows):
     n = len(problem.z)
     part = problem.part(spread(n, rows if problem.sound else min(rows, LEARN_ROWS_REPAIRED)))
     theta, _ = maximise(part, random_starts(part, restarts, seed, length_max), length_max)
-    if len(part.z) < n and problem.sound:
-        theta, _, _ = refine(problem.part(spread(n, REFINE_ROWS)), part, theta, length_max, REFINE_EVALUATIONS)
-    return theta
+    return theta if len(part.z) == n else polish(problem, theta, length_max, len(part.z))
+
+
+def polish(problem, theta, length_max, rows):
+    """theta nearer to the maximum on REFINE_ROWS, the curvature taken from `rows` of them. A repair is left alone."""
+    if not problem.sound:
+        return theta
+    n = len(problem.z)
+    whole, part = problem.part(spread(n, REFINE_ROWS)), problem.part(spread(n, rows))
+    return refine(whole, part, theta, length_max, REFINE_EVALUATIONS)[0]
 
 
 def thorough(problem, theta, length_max, restarts, seed):

@@ -1,16 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """gp.py against scikit-learn, brute force and finite differences, and in the cases where such code breaks."""
 
+import json
 import warnings
 
 import numpy as np
 import pytest
+from gp_reference import CASES, KERNELS, LENGTH, hyper_for, quietly, recording, written_out
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from sparsegaze import gp as module
 from sparsegaze.errors import CalibrationError
 from sparsegaze.gp import GaussianProcess, Hyper
+
+
+every_kernel = pytest.mark.parametrize("name, p", KERNELS)
 
 
 def data(n=60, d=6, seed=0, noise=0.2):
@@ -232,3 +237,93 @@ def test_prediction_in_blocks_is_prediction_at_once(monkeypatch):
 def test_unknown_mean_is_a_programming_error():
     with pytest.raises(ValueError, match="cubic"):
         GaussianProcess.fit(*data(20), mean="cubic")
+
+
+@every_kernel
+@pytest.mark.parametrize("mean", ["zero", "constant", "linear"])
+def test_the_gradient_of_the_mean_equals_high_order_differences(name, p, mean):
+    features, gaze = recording(40)
+    gp = quietly(features, gaze, mean=mean, kernel=name, p=p, hyper=hyper_for(name, 3.0, 30.0, 0.3))
+    query = recording(8, seed=7)[0]
+    slope = gp.gradient(query)
+    for j in range(6):
+        step = np.zeros(6)
+        step[j] = 0.5
+        at = {k: gp.predict(query + k * step) for k in (-3, -2, -1, 1, 2, 3)}
+        expected = ((at[3] - at[-3]) / 60 - 3 * (at[2] - at[-2]) / 20 + 3 * (at[1] - at[-1]) / 4) / 0.5
+        # At a sample of the same value in channel j kernels with a cusp have none; these queries avoid it by > 2.
+        apart = np.abs(query[:, None, j] - gp.x[:, j]).min(axis=1) > 2.0
+        smooth = name in ("rbf", "matern52", "cosine")
+        rows = np.ones(8, bool) if smooth else apart
+        np.testing.assert_allclose(slope[rows, :, j], expected[rows], rtol=2e-4, atol=2e-6)
+
+
+@every_kernel
+def test_describe_is_json_and_names_what_a_reader_needs(name, p):
+    gp = quietly(*recording(30), mean="constant", kernel=name, p=p, restarts=0)
+    told = json.loads(json.dumps(gp.describe(), allow_nan=False))
+    assert told["kernel"] == name and told["lml"] == gp.lml and told["rows"] == told["rows_given"] == 30
+    for key in ("formula", "length_unit", "condition", "jitter", "loo_rms_deg", "rounding_deg", "repair", "p"):
+        assert key in told
+
+
+def test_learning_on_a_part_and_polishing_on_all_reaches_the_likelihood_of_learning_on_all():
+    features, gaze = recording(240)
+    whole = quietly(features, gaze, mean="constant", restarts=0)
+    part = quietly(features, gaze, mean="constant", restarts=0, learn_rows=100)
+    assert part.lml > whole.lml - 0.5
+    assert 0 <= part.likelihood_gap(restarts=0) < 1.0
+    poor = quietly(features, gaze, mean="constant", hyper=Hyper(LENGTH, 30.0, 1.0))
+    assert poor.likelihood_gap(restarts=0) == pytest.approx(whole.lml - poor.lml, abs=1.0)
+
+
+@pytest.mark.parametrize("mean", ["zero", "constant", "linear"])
+@pytest.mark.parametrize("case", [case for case in CASES if case not in ("p=3", "p=10", "p=inf")])
+def test_mean_and_deviation_equal_the_equations_of_universal_kriging(case, mean):
+    """R & W equations 2.41 and 2.42 by dense solves, the kernel written out, for every kernel."""
+    features, gaze = recording(30)
+    query = recording(12, seed=2)[0]
+    name, p, exponent = CASES[case]
+    hyper = hyper_for(name, 2.0, 25.0, 0.4)
+    scale = np.random.default_rng(1).uniform(0.5, 2, 30)
+    gp = quietly(features, gaze, scale, mean=mean, hyper=hyper, kernel=name, p=p, exponent=exponent)
+    k = 625.0 * written_out(case, features, features, hyper.length).real + 0.16 * np.diag(scale)
+    cross = 625.0 * written_out(case, query, features, hyper.length).real
+    h, at = {
+        "zero": lambda x: np.empty((len(x), 0)),
+        "constant": lambda x: np.ones((len(x), 1)),
+        "linear": lambda x: np.hstack([np.ones((len(x), 1)), (x - 45000) / 1000]),
+    }[mean], np.linalg.solve(k, cross.T)
+    normal = h(features).T @ np.linalg.solve(k, h(features))
+    b = np.linalg.solve(normal, h(features).T @ np.linalg.solve(k, gaze))
+    r = h(query).T - h(features).T @ at
+    expected = h(query) @ b + cross @ np.linalg.solve(k, gaze - h(features) @ b)
+    variance = 625.0 - np.sum(cross * at.T, axis=1) + np.sum(r * np.linalg.solve(normal, r), axis=0)
+    got, std = gp.predict(query, return_std=True)
+    np.testing.assert_allclose(got, expected, atol=1e-6)
+    np.testing.assert_allclose(std, np.sqrt(variance), rtol=1e-5)
+
+
+def test_refining_given_parameters_reaches_the_likelihood_of_learning():
+    features, gaze = recording(300)
+    learnt = quietly(features, gaze, mean="constant", restarts=0)
+    near = Hyper(learnt.hyper.length * 1.3, learnt.hyper.signal_deg * 0.8, learnt.hyper.noise_deg * 1.2)
+    given = quietly(features, gaze, mean="constant", hyper=near)
+    refined = quietly(features, gaze, mean="constant", hyper=near, refine=True, learn_rows=100)
+    assert given.lml < learnt.lml - 5 and refined.lml > learnt.lml - 0.1
+
+
+@pytest.mark.parametrize(
+    "hyper, words",
+    [
+        (Hyper(LENGTH[:5], 10.0, 0.1), "5 length scales for 6 channels"),
+        (Hyper(-LENGTH, 10.0, 0.1), "must be above 0"),
+        (Hyper(np.full(6, np.inf), 10.0, 0.1), "finite"),
+        (Hyper(LENGTH, 0.0, 0.1), "signal_deg"),
+        (Hyper(LENGTH, 10.0, -0.1), "noise_deg"),
+        (Hyper(LENGTH, np.nan, 0.1), "signal_deg"),
+    ],
+)
+def test_impossible_parameters_are_refused_in_words(hyper, words):
+    with pytest.raises(CalibrationError, match=words):
+        GaussianProcess.fit(*recording(20), mean="constant", hyper=hyper)

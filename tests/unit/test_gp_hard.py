@@ -1,114 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The hard cases of a calibration's mathematics, each with what the process must do; references in 60 digits.
+"""The hard cases of a calibration's mathematics, each with what the process must do; references in 60 digits."""
 
-The reference solves the same equations by Gaussian elimination in decimal arithmetic, from the definitions of the
-kernels; it shares no line with the product.
-"""
-
-import json
+import os
 import subprocess
 import sys
-import warnings
-from decimal import Decimal, getcontext
 
 import numpy as np
 import pytest
+from gp_reference import KERNELS, LENGTH, hyper_for, quietly, recording, reference
 
 from sparsegaze.errors import CalibrationError
 from sparsegaze.gp import GaussianProcess, Hyper
 
-getcontext().prec = 60
-LENGTH = np.array([900.0, 1200, 700, 1500, 1000, 800])
-KERNELS = [
-    ("rbf", None),
-    ("matern52", None),
-    ("laplace", None),
-    ("minkowski", 0.5),
-    ("minkowski", 1.5),
-    ("canberra", None),
-    ("cosine", None),
-]
 every_kernel = pytest.mark.parametrize("name, p", KERNELS)
-
-
-def recording(n, seed=0, noise_deg=0.2, step_noise=5.0):
-    """Six smooth channels over +-20 deg of a simulated eye: (features [n, 6], gaze [n, 2])."""
-    rng = np.random.default_rng([11, seed])
-    gaze = rng.uniform(-20, 20, (n, 2))
-    angle = np.arange(6) * np.pi / 3
-    place = 25 * np.stack([np.cos(angle), np.sin(angle)], 1)
-    bump = np.exp(-((gaze[:, None] - place) ** 2).sum(-1) / (2 * 18.0**2))
-    features = 45000 + 4096 * np.log2(1 - 0.5 * bump) + step_noise * rng.standard_normal((n, 6))
-    return features, gaze + noise_deg * rng.standard_normal((n, 2))
-
-
-def quietly(*args, **kwargs):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return GaussianProcess.fit(*args, **kwargs)
-
-
-def exactly(values):
-    return [Decimal(float(v)) for v in values]
-
-
-def decimal_kernel(name, p, a, b, length):
-    gaps = [abs(u - v) for u, v in zip(a, b)]
-    scaled = [g / w for g, w in zip(gaps, length)]
-    if name == "rbf":
-        return (-sum(g * g for g in scaled) / 2).exp()
-    if name == "matern52":
-        r = (5 * sum(g * g for g in scaled)).sqrt()
-        return (1 + r + r * r / 3) * (-r).exp()
-    if name == "canberra":
-        return (-sum(g / (u + v) / w for g, u, v, w in zip(gaps, a, b, length))).exp()
-    if name == "cosine":
-        norm = (sum(u * u for u in a) * sum(v * v for v in b)).sqrt()
-        return ((sum(u * v for u, v in zip(a, b)) / norm - 1) / length[0] ** 2).exp()
-    power = Decimal(1 if name == "laplace" else p)
-    return (-sum((g.ln() * power).exp() if g else Decimal(0) for g in scaled)).exp()
-
-
-def decimal_solve(matrix, right):
-    """Gaussian elimination with pivoting."""
-    n, rows = len(matrix), [a[:] + b[:] for a, b in zip(matrix, right)]
-    for i in range(n):
-        pivot = max(range(i, n), key=lambda r: abs(rows[r][i]))
-        rows[i], rows[pivot] = rows[pivot], rows[i]
-        for r in range(i + 1, n):
-            f = rows[r][i] / rows[i][i]
-            if f:
-                rows[r] = [u - f * v for u, v in zip(rows[r], rows[i])]
-    result = [None] * n
-    for i in reversed(range(n)):
-        done = [sum(rows[i][c] * result[c][o] for c in range(i + 1, n)) for o in range(len(right[0]))]
-        result[i] = [(rows[i][n + o] - d) / rows[i][i] for o, d in enumerate(done)]
-    return result
-
-
-def reference(gp, query, p=None):
-    """The mean [m, 2] of gp at query in 60 digits, mean zero or constant, the jitter it reports included."""
-    length = exactly(gp.hyper.length)
-    s2, noise2 = Decimal(float(gp.hyper.signal_deg)) ** 2, Decimal(float(gp.hyper.noise_deg)) ** 2
-    x = [exactly(row) for row in gp.x]
-    k = [[s2 * decimal_kernel(gp.kernel.name, p, a, b, length) for b in x] for a in x]
-    for i, scale in enumerate(exactly(gp.noise_scale)):
-        k[i][i] += noise2 * scale
-    extra = Decimal(gp.jitter) * sum(k[i][i] for i in range(len(x))) / len(x)
-    for i in range(len(x)):
-        k[i][i] += extra
-    right, one = [exactly(row) for row in gp.y], [Decimal(1)] if gp.mean == "constant" else []
-    if one:
-        k = [row + one for row in k] + [one * len(x) + [Decimal(0)]]
-        right.append([Decimal(0)] * 2)
-    weights = decimal_solve(k, right)
-    rows = [[s2 * decimal_kernel(gp.kernel.name, p, exactly(q), b, length) for b in x] + one for q in query]
-    return np.array([[float(sum(u * w[o] for u, w in zip(row, weights))) for o in (0, 1)] for row in rows])
-
-
-def hyper_for(name, scale, signal_deg, noise_deg):
-    length = LENGTH * {"canberra": 1e-5}.get(name, 1.0) * scale
-    return Hyper(np.full(6, 0.05 * scale) if name == "cosine" else length, signal_deg, noise_deg)
 
 
 @pytest.mark.parametrize("mean", ["zero", "constant"])
@@ -326,87 +230,6 @@ def test_all_targets_on_a_line(name, p):
     np.testing.assert_allclose(got[:, 1], 0.5 * got[:, 0] + 1.0, atol=1e-4)
 
 
-@pytest.mark.parametrize("p", [0.5, 1.0, 1.5, 2.0])
-def test_p_up_to_2_is_positive_definite_and_needs_no_repair(p):
-    features, gaze = recording(60)
-    gp = quietly(features, gaze, mean="constant", kernel="minkowski", p=p, restarts=0)
-    told = gp.describe()
-    assert gp.repair is None and told["positive_definite"] and told["p"] == p and gp.jitter == 0
-    error = np.linalg.norm(gp.y - gp.loo()[0], axis=1)
-    assert np.sqrt(np.mean(error**2)) == pytest.approx(told["loo_rms_deg"]) and told["loo_rms_deg"] < 5
-
-
-def test_p_1_is_laplace_and_p_2_is_rbf_of_another_length():
-    features, gaze = recording(30)
-    query, hyper = recording(10, seed=1)[0], Hyper(LENGTH, 20.0, 0.3)
-    for p, name, factor in ((1.0, "laplace", 1.0), (2.0, "rbf", np.sqrt(0.5))):
-        a = GaussianProcess.fit(features, gaze, hyper=hyper, kernel="minkowski", p=p)
-        b = GaussianProcess.fit(features, gaze, hyper=Hyper(LENGTH * factor, 20.0, 0.3), kernel=name)
-        np.testing.assert_allclose(a.predict(query), b.predict(query), atol=1e-8)
-
-
-def indefinite(p, n=200):
-    """Samples that fill six dimensions, on which p > 2 shows: (features [n, 6], gaze [n, 2], Hyper)."""
-    rng = np.random.default_rng(1)
-    z = rng.standard_normal((n, 6))
-    gaze = 8 * np.stack([np.sin(z[:, 0]) + z[:, 1], z[:, 2]], 1) + 0.3 * rng.standard_normal((n, 2))
-    return 40000 + 1000 * z, gaze, Hyper(np.full(6, 3e4), 60.0, 0.3)
-
-
-@pytest.mark.parametrize("p", [3.0, 10.0, np.inf])
-def test_p_above_2_is_repaired_in_words_and_predicts_consistently(p):
-    features, gaze, hyper = indefinite(p)
-    with pytest.warns(UserWarning, match="gives no covariance in 3 or more channels.*eigenvalues.*were removed"):
-        gp = GaussianProcess.fit(features, gaze, mean="constant", kernel="minkowski", p=p, hyper=hyper)
-    assert gp.repair["smallest_eigenvalue"] < -1e-3 and 0 < gp.repair["removed_share"] < 0.5
-    assert gp.repair["negative"] > 0 and gp.repair["rank"] + gp.repair["negative"] <= 200
-    assert not gp.describe()["positive_definite"] and "removed" in gp.describe()["repair"]["words"]
-    # The matrix that is solved is a covariance: no eigenvalue is below the noise.
-    solved = gp._factor[0] @ gp._factor[0].T
-    noise2 = gp.hyper.noise_deg**2
-    assert np.linalg.eigvalsh(solved)[0] > 0.99 * noise2
-    # It is the kernel's own matrix less its negative part ...
-    own = gp._kernel(gp.x) + noise2 * np.eye(200)
-    least = np.linalg.eigvalsh(own - noise2 * np.eye(200))[0]
-    assert np.linalg.norm(solved - own, 2) == pytest.approx(-least, rel=1e-6)
-    # ... and predictions at the data are that matrix's: S y with S = K+ (K+ + noise)^-1 and a constant.
-    one = np.ones((200, 1))
-    inside = solved - noise2 * np.eye(200)
-    b = np.linalg.solve(one.T @ np.linalg.solve(solved, one), one.T @ np.linalg.solve(solved, gp.y))
-    expected = inside @ np.linalg.solve(solved, gp.y - one @ b) + one @ b
-    np.testing.assert_allclose(gp.predict(gp.x), expected, atol=1e-6)
-    mean, std = gp.predict(gp.x + 300.0, return_std=True)
-    assert np.isfinite(mean).all() and std.min() > 0
-
-
-@pytest.mark.parametrize("p", [3.0, 10.0])
-def test_p_above_2_learns_and_says_when_nothing_had_to_be_removed(p):
-    features, gaze = recording(70)
-    gp = quietly(features, gaze, mean="constant", kernel="minkowski", p=p, restarts=0)
-    assert gp.repair["negative"] == 0 and "nothing had to be removed" in gp.repair["words"]
-    error = gp.predict(recording(100, 6)[0]) - recording(100, 6)[1]
-    assert np.sqrt(np.mean(error**2)) < 3
-
-
-def test_leave_one_out_of_a_repaired_process_is_that_of_its_matrix():
-    features, gaze, hyper = indefinite(10.0)
-    gp = quietly(features, gaze, mean="zero", kernel="minkowski", p=10.0, hyper=hyper)
-    solved = gp._factor[0] @ gp._factor[0].T
-    assert gp.repair["negative"] > 0
-    predicted, _ = gp.loo()
-    for i in (0, 13, 39):
-        rest = np.arange(200) != i
-        expected = solved[i, rest] @ np.linalg.solve(solved[np.ix_(rest, rest)], gp.y[rest])
-        np.testing.assert_allclose(predicted[i], expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("p", [3.0, 10.0])
-def test_p_above_2_in_two_channels_is_a_covariance_and_left_alone(p):
-    features, gaze = recording(40)
-    gp = quietly(features[:, :2], gaze, mean="constant", kernel="minkowski", p=p, restarts=0)
-    assert gp.repair is None and gp.describe()["positive_definite"]
-
-
 def test_weights_that_alternate_hugely_still_give_the_right_digits():
     """Neighbours 1 step apart with labels of +-5 deg and hardly any noise: weights 1e6 times the answer."""
     rng = np.random.default_rng(1)
@@ -447,25 +270,6 @@ def test_queries_of_another_width_or_outside_the_measure_are_refused():
     assert gp.predict(features[:0]).shape == (0, 2)
 
 
-@every_kernel
-@pytest.mark.parametrize("mean", ["zero", "constant", "linear"])
-def test_the_gradient_of_the_mean_equals_high_order_differences(name, p, mean):
-    features, gaze = recording(40)
-    gp = quietly(features, gaze, mean=mean, kernel=name, p=p, hyper=hyper_for(name, 3.0, 30.0, 0.3))
-    query = recording(8, seed=7)[0]
-    slope = gp.gradient(query)
-    for j in range(6):
-        step = np.zeros(6)
-        step[j] = 0.5
-        at = {k: gp.predict(query + k * step) for k in (-3, -2, -1, 1, 2, 3)}
-        expected = ((at[3] - at[-3]) / 60 - 3 * (at[2] - at[-2]) / 20 + 3 * (at[1] - at[-1]) / 4) / 0.5
-        # At a sample of the same value in channel j kernels with a cusp have none; these queries avoid it by > 2.
-        apart = np.abs(query[:, None, j] - gp.x[:, j]).min(axis=1) > 2.0
-        smooth = name in ("rbf", "matern52", "cosine")
-        rows = np.ones(8, bool) if smooth else apart
-        np.testing.assert_allclose(slope[rows, :, j], expected[rows], rtol=2e-4, atol=2e-6)
-
-
 def test_order_and_threads_do_not_change_a_bit_whatever_the_kernel(tmp_path):
     """Another process with four threads of BLAS, the samples shuffled: the same bytes."""
     features, gaze = recording(300)
@@ -483,26 +287,7 @@ def test_order_and_threads_do_not_change_a_bit_whatever_the_kernel(tmp_path):
     )
     answers = []
     for seed, threads in (("1", "1"), ("2", "4")):
-        env = dict(__import__("os").environ, OMP_NUM_THREADS=threads, OPENBLAS_NUM_THREADS=threads)
+        env = dict(os.environ, OMP_NUM_THREADS=threads, OPENBLAS_NUM_THREADS=threads)
         done = subprocess.run([sys.executable, "-c", script, seed], env=env, capture_output=True, text=True, check=True)
         answers.append(done.stdout)
     assert answers[0] == answers[1] and len(answers[0]) > 10_000
-
-
-@every_kernel
-def test_describe_is_json_and_names_what_a_reader_needs(name, p):
-    gp = quietly(*recording(30), mean="constant", kernel=name, p=p, restarts=0)
-    told = json.loads(json.dumps(gp.describe(), allow_nan=False))
-    assert told["kernel"] == name and told["lml"] == gp.lml and told["rows"] == told["rows_given"] == 30
-    for key in ("formula", "length_unit", "condition", "jitter", "loo_rms_deg", "rounding_deg", "repair", "p"):
-        assert key in told
-
-
-def test_learning_on_a_part_and_polishing_on_all_reaches_the_likelihood_of_learning_on_all():
-    features, gaze = recording(400)
-    whole = quietly(features, gaze, mean="constant")
-    part = quietly(features, gaze, mean="constant", learn_rows=130)
-    assert part.lml > whole.lml - 0.5
-    assert 0 <= part.likelihood_gap(restarts=1) < 1.0
-    poor = quietly(features, gaze, mean="constant", hyper=Hyper(LENGTH, 30.0, 1.0))
-    assert poor.likelihood_gap(restarts=1) > 10
