@@ -98,6 +98,22 @@ def test_without_root_the_line_to_run_is_printed_and_nothing_is_installed(traps,
     assert not (bare_tree / ".venv").exists()
 
 
+def test_the_cortex_m4s_compiler_and_machine_are_asked_for_by_what_they_provide(tmp_path, traps, bare_tree):
+    folder, _ = traps
+    fake(folder, "id", "echo 1000")
+    # Everything that is on this machine's PATH but the two.
+    there = {"arm-none-eabi-gcc", "qemu-system-arm", *os.listdir(folder)}
+    for place in filter(os.path.isdir, os.environ["PATH"].split(os.pathsep)):
+        for name in set(os.listdir(place)) - there:
+            (folder / name).symlink_to(os.path.join(place, name))
+            there.add(name)
+    done = subprocess.run(["sh", "tools/setup.sh"], cwd=bare_tree, env=dict(os.environ, PATH=str(folder)),
+                          capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    wanted = done.stderr.split("sudo apt-get install ")[-1].split()
+    assert {"gcc-arm-none-eabi", "qemu-system-arm"} <= set(wanted)
+
+
 def test_a_failing_apt_get_is_one_line_with_its_log(traps, bare_tree):
     folder, trace = traps
     fake(folder, "id", "echo 0")

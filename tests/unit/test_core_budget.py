@@ -34,7 +34,8 @@ def gp_case():
     feature = (20000 + 1600 * 4096 // 1500 + rng.integers(0, 40, (20, 6))).astype(np.uint16)
     return {"body": "sg_track_infer(&view, (const uint16_t *)in, 0, &recentre, (struct sg_gaze *)out);",
             "inputs": feature, "out_bytes": 12, "includes": ["sg_track.h", "sg_err.h"],
-            "setup": "struct sg_model_view view; const struct sg_affine recentre = { { 9, -9 }, { 1, 2, 3, 4 } };"
+            "setup": "struct sg_model_view view;"
+                     "const struct sg_affine recentre = { { 9, -9 }, { 1, 2, 3, 4 } };"
                      "if (sg_model_open(&view, image, sizeof image, CASE_SPACE) != SG_OK) return 1;",
             "data": {"image": parts.image()}}
 
@@ -50,9 +51,31 @@ def mlp_case():
             "data": {"image": model.image}}
 
 
+def feature_case():
+    """Readings of every size: bright and dark, short and long exposures."""
+    rng = np.random.default_rng(4)
+    code = rng.integers(0, 4093, (40, 6))
+    exposure = rng.integers(256, 4865, (40, 6))
+    return {"body": "out[12] = sg_track_features((const uint16_t *)in, (const uint16_t *)in + 6, "
+                    "(uint16_t *)out);",
+            "inputs": np.concatenate([code, exposure], axis=1).astype(np.uint16), "out_bytes": 13,
+            "includes": ["sg_track.h"]}
+
+
+def packet_case():
+    """A gaze into a packet and back."""
+    rng = np.random.default_rng(5)
+    body = rng.integers(0, 256, (20, 12), np.uint8) * (rng.random((20, 12)) < 0.6)
+    return {"body": "struct sg_head head = { .seq = 257, .type = SG_MSG_GAZE };"
+                    "int n = sg_wire_encode(&head, in, 12, out);"
+                    "sg_wire_decode(out, (size_t)n - 1, &head, out + 40);",
+            "inputs": body, "out_bytes": 104, "includes": ["sg_wire.h"]}
+
+
 # function: the case that runs it
 FUNCTIONS = {"sg_track_infer": gp_case, "sg_gp_predict": gp_case, "sg_gp_loop": gp_case,
-             "sg_mlp_predict": mlp_case}
+             "sg_gp_trust": gp_case, "sg_model_open": gp_case, "sg_track_features": feature_case, "sg_wire_encode": packet_case,
+             "sg_wire_decode": packet_case, "sg_mlp_predict": mlp_case}
 
 
 def footprint_of(target, elf):
