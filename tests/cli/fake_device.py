@@ -27,7 +27,7 @@ def linear_model(generation=1, inverse=None, n_vectors=64):
     """The DeviceModel of gaze = inverse (feature - MIDDLE) (default: of OPTICS), [2, 6] deg per step."""
     # s = (feature - offset) / 2
     inverse = np.linalg.pinv(OPTICS) if inverse is None else inverse
-    unit = 2.0**-24
+    unit = 2.0**-20
     offset = MIDDLE - 4095
     trend = np.round(2 * inverse / unit).astype(np.int64)
     bias = np.round(inverse @ np.full(6, offset - MIDDLE) / unit).astype(np.int64)

@@ -14,15 +14,14 @@ FIRMWARE = REPO / "firmware"
 AVR_FLAGS = ["-mmcu=atmega328p", "-DF_CPU=16000000L", "-O2", "-std=gnu11"]
 
 
-def make_image(seed, vectors=64, generation=0):
+def make_image(seed, vectors=70, generation=0):
     """Bytes of a valid model with arbitrary numbers drawn from `seed`."""
     rng = np.random.default_rng(seed)
     return DeviceModel.from_parts(
         offset=rng.integers(0, 30000, 6), gain_q12=rng.integers(200, 4000, 6),
         bias=rng.integers(-(1 << 24), 1 << 24, 2), trend=rng.integers(-2000, 2000, (2, 6)),
         centres=rng.integers(0, 256, (vectors, 6)), weights=rng.integers(-3000, 3000, (vectors, 2)),
-        weight_frac_bits=8, guards=[(-(1 << 20), 1 << 20, rng.integers(-100, 100, 6)) for _ in range(3)],
-        generation=generation).image
+        weight_frac_bits=8, generation=generation).image
 
 
 def make_hex(path, data, start=0):

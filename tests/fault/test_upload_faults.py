@@ -61,7 +61,7 @@ def test_wrong_magic_version_dimension_and_kernel_each_say_what_is_wrong():
 
 
 def test_a_model_the_connected_firmware_cannot_take_is_refused_before_a_reset():
-    for hello, text in (({"model_version": 2}, "the device takes 2"), ({"channels": 4}, "the device has 4"),
+    for hello, text in (({"model_version": 3}, "the device takes 3"), ({"channels": 4}, "the device has 4"),
                         ({"slot_bytes": 1024}, "a slot of the device holds 1024")):
         with FakeBoard(hello=hello) as board:
             with pytest.raises(ModelError, match=text):
@@ -75,7 +75,7 @@ def test_uploads_alternate_between_the_slots_and_generations_grow():
         reports = [store.upload(board.port, image) for image in images]
         assert [report.slot for report in reports] == [0, 1, 0]
         assert [report.generation for report in reports] == [1, 2, 3]
-        assert [report.vectors for report in reports] == [64] * 3
+        assert [report.vectors for report in reports] == [70] * 3
         stored = bytes(board.flash[0x6000:0x6000 + len(images[2])])
         assert stored == store.stamp(images[2], 3)
         assert ffi.from_buffer("struct sg_model_head *", stored).crc == reports[2].crc

@@ -129,38 +129,76 @@ static void put32(uint8_t *at, uint32_t value)
         at[i] = (uint8_t)(value >> (8 * i));
 }
 
+static void put16(uint8_t *at, uint32_t value)
+{
+    at[0] = (uint8_t)value;
+    at[1] = (uint8_t)(value >> 8);
+}
+
+#define HEAD(field) offsetof(struct sg_model_head, field)
+#define TRUST(field) (SG_MODEL_PAGE + offsetof(struct sg_model_trust, field))
+
+// Trust page of a model with wild content: every value that the format allows.
+static void make_trust(uint8_t *image, uint8_t guards, const uint8_t nodes[2])
+{
+    for (uint8_t i = 0; i < guards; i++) {
+        uint8_t *guard = image + TRUST(guard) + i * sizeof(struct sg_model_guard);
+        fill(guard, sizeof(struct sg_model_guard));
+        const uint32_t width = draw(65536), low = draw(65536 - width);      // from -32768 on
+        put16(guard + offsetof(struct sg_model_guard, base), draw(32769) - 16384);
+        put16(guard + offsetof(struct sg_model_guard, low), low - 32768);
+        put16(guard + offsetof(struct sg_model_guard, high), low + width - 32768);
+    }
+    for (int i = 0; i < 2; i++) {
+        put16(image + TRUST(origin_deg_q7) + 2 * i, draw(32769) - 16384);
+        image[TRUST(scale) + i] = (uint8_t)(1 + draw(255));
+        image[TRUST(nodes) + i] = nodes[i];
+    }
+    put16(image + TRUST(limit), draw(65536));
+    image[TRUST(guards)] = guards;
+    image[TRUST(sigma_gain)] = (uint8_t)draw(256);
+}
+
 // A model that is right in form, with wild content, then some damage, then often a CRC that fits the damage.
 static size_t make_model(uint8_t **out)
 {
-    const uint8_t vectors = (uint8_t)(1 + draw(draw(8) ? 20 : SG_MODEL_VECTORS_MAX));
-    const size_t n = SG_MODEL_HEAD_BYTES + (size_t)vectors * SG_MODEL_RECORD_BYTES;
+    const uint8_t guards = (uint8_t)draw(SG_MODEL_GUARDS + 1);
+    uint8_t nodes[2] = { 0, 0 };
+    if (draw(2))
+        for (int i = 0; i < 2; i++)
+            nodes[i] = (uint8_t)(2 + draw(draw(4) ? 8 : SG_MODEL_NODES_MAX - 1));
+    const size_t grid = (size_t)nodes[0] * nodes[1] * SG_MODEL_NODE_BYTES;
+    const size_t room = SG_MODEL_SLOT_BYTES - SG_MODEL_HEAD_BYTES < grid
+                            ? 0 : (SG_MODEL_SLOT_BYTES - SG_MODEL_HEAD_BYTES - grid) / SG_MODEL_RECORD_BYTES;
+    const uint8_t vectors = (uint8_t)(1 + draw(draw(8) || room < 20 ? 20 : (uint32_t)room));
+    const size_t n = SG_MODEL_HEAD_BYTES + grid + (size_t)vectors * SG_MODEL_RECORD_BYTES;
     uint8_t *image = block(n);
     memset(image, 0, n);
     put32(image, SG_MODEL_MAGIC);
-    put32(image + offsetof(struct sg_model_head, length), (uint32_t)n);
-    for (size_t i = offsetof(struct sg_model_head, bias); i < offsetof(struct sg_model_head, version); i++)
-        image[i] = (uint8_t)draw(256);
-    image[offsetof(struct sg_model_head, version)] = SG_MODEL_VERSION;
-    image[offsetof(struct sg_model_head, vectors)] = vectors;
-    image[offsetof(struct sg_model_head, channels)] = SG_MODEL_CHANNELS;
-    image[offsetof(struct sg_model_head, weight_frac_bits)] = (uint8_t)(6 + draw(5));
-    const uint8_t guards = (uint8_t)draw(9);
-    image[offsetof(struct sg_model_head, guards)] = guards;
-    for (uint8_t i = 0; i < guards; i++) {
-        uint8_t *guard = image + SG_MODEL_PAGE + i * sizeof(struct sg_model_guard);
-        for (size_t j = 0; j < offsetof(struct sg_model_guard, reserved); j++)
-            guard[j] = (uint8_t)draw(256);
-        guard[3] |= 0x80;   // low < 0 <= high
-        guard[7] &= 0x7F;
+    put32(image + HEAD(length), (uint32_t)n);
+    fill(image + HEAD(trend), HEAD(version) - HEAD(trend));
+    for (int i = 0; i < 2; i++)
+        put32(image + HEAD(bias) + 4 * i, draw(0x80000001u) - 0x40000000u);
+    image[HEAD(version)] = SG_MODEL_VERSION;
+    image[HEAD(vectors)] = vectors;
+    image[HEAD(channels)] = SG_MODEL_CHANNELS;
+    image[HEAD(weight_frac_bits)] = (uint8_t)(5 + draw(5));
+    make_trust(image, guards, nodes);
+    for (size_t at = SG_MODEL_HEAD_BYTES; at < SG_MODEL_HEAD_BYTES + grid; at += SG_MODEL_NODE_BYTES) {
+        fill(image + at, guards);
+        image[at + SG_MODEL_GUARDS] = (uint8_t)(1 + draw(255));
     }
-    for (size_t i = SG_MODEL_HEAD_BYTES; i < n; i++)
-        image[i] = (uint8_t)draw(256);
-    for (uint8_t i = 0; i < vectors; i++)
-        image[SG_MODEL_HEAD_BYTES + i * SG_MODEL_RECORD_BYTES + 2] &= 0x3F;
+    for (size_t at = SG_MODEL_HEAD_BYTES + grid; at < n; at += SG_MODEL_RECORD_BYTES) {
+        uint32_t c2 = 31;
+        fill(image + at + 2, SG_MODEL_RECORD_BYTES - 2);
+        for (int j = 0; j < SG_MODEL_CHANNELS; j++)
+            c2 += (uint32_t)image[at + 2 + j] * image[at + 2 + j];
+        put16(image + at, c2 >> 5);
+    }
     for (uint32_t damage = draw(3); damage != 0; damage--)
         image[draw(draw(2) ? SG_MODEL_HEAD_BYTES : (uint32_t)n)] ^= (uint8_t)(1u << draw(8));
     if (draw(8))
-        put32(image + 4, sg_model_crc32(0, image + 8, n - 8));
+        put32(image + HEAD(crc), sg_model_crc32(0, image + 8, n - 8));
     *out = image;
     return n;
 }
