@@ -13,6 +13,7 @@
 struct layer {
     uint8_t columns;
     uint8_t rows;                // rounded up to even
+    uint8_t padded;              // the last row is one too many
     uint8_t weight_bytes;
 };
 
@@ -28,7 +29,9 @@ static struct layer layer_at(const uint8_t *image, uint8_t space, uint8_t k)
     const uint8_t hidden = sg_rom_byte(image + HEAD(hidden), space);
     struct layer layer;
     layer.columns = sg_rom_byte(k == 0 ? image + HEAD(inputs) : width + k - 1, space);
-    layer.rows = even(sg_rom_byte(k == hidden ? image + HEAD(outputs) : width + k, space));
+    const uint8_t rows = sg_rom_byte(k == hidden ? image + HEAD(outputs) : width + k, space);
+    layer.rows = even(rows);
+    layer.padded = rows & 1U;
     layer.weight_bytes = sg_rom_byte(image + HEAD(weight_bytes) + k, space);
     return layer;
 }
@@ -89,7 +92,7 @@ static uint8_t row_is_safe(const uint8_t *at, const uint8_t *weight, const struc
            bias - (negative + layer->columns) * 256L >= -0x800000L;
 }
 
-// Walks one layer. Returns its end, or NULL if a row could overflow.
+// Walks one layer. Returns its end, or NULL if a row could overflow, or if the row too many could saturate.
 static const uint8_t *checked_layer(const uint8_t *at, const struct layer *layer, uint8_t space)
 {
     for (uint8_t left = layer->rows; left != 0;) {
@@ -104,6 +107,8 @@ static const uint8_t *checked_layer(const uint8_t *at, const struct layer *layer
         at += (uint16_t)((uint16_t)layer->columns * (uint8_t)(n * layer->weight_bytes)) + 2U * n;
         left = (uint8_t)(left - n);
     }
+    if (layer->padded && sg_rom_u16(at - 2, space) != 0)
+        return NULL;
     return at;
 }
 

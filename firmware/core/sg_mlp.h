@@ -3,7 +3,7 @@
 // one image in memory or program flash. Second predictor beside sg_gp; the network of NextGaze has this form.
 //
 // An image is  head (64 B) | layer | layer | ...  All fields little endian, no alignment. A layer of r rows
-// on c columns: r is rounded up to even (a row too many is computed and dropped), and the rows stand in
+// on c columns: r is rounded up to even (the row too many has scale 0), and the rows stand in
 // groups of n = 4, at the end perhaps one of n = 2:
 //   bias s24[n] | weight [c][n], 1 or 2 bytes each, as w + 128 or w + 32768 | scale u16[n]
 //
@@ -16,7 +16,8 @@
 //   hidden: u = min(q_i, 65535), argument in units of ln 2 / 8192; i = u >> 8; f = u & 255
 //           t = T[i] + (((T[i + 1] - T[i]) * f + 128) >> 8),  a_i = 32768 + t if z_i >= 0 else 32768 - t
 //   output: y_i = min((q_i + 128) >> 8, 32767) with the sign of z_i
-//   T[i]  = 32768 tanh(i ln 2 / 32), raised by half of how far a chord falls short at most; T[0] = 0, T[256] = 32767
+//   T[i]  = 32768 tanh(i ln 2 / 32), raised by half of how far a chord falls short at most; T[0] = 0,
+//           T[256] = 32767
 // So the bias contains -128 sum_j (true w_ij), because a is offset; a row's scale frees its weights to use
 // all their bits; L >> 1 stands for the mean of what the product of two low bytes, which is left out, owes to
 // a; and the real-number network is  y = W tanh(... tanh(W a + b)) + b.
@@ -85,8 +86,8 @@ struct sg_mlp_view {
 // Checked, in this order: room for the head (SG_E_SHORT), magic (SG_E_MAGIC), version (SG_E_VERSION), counts,
 // widths, weight_bytes and the length that follows from them (SG_E_BOUNDS), room for it (SG_E_SHORT), the CRC
 // (SG_E_CRC), then SG_E_BOUNDS for: a reserved byte or the input of a channel that is not in use not 0; a row
-// whose z could leave 24 bits for some activations, with P and N the sums of its positive and negative
-// weights:
+// too many whose scale is not 0; a row whose z could leave 24 bits for some activations, with P and N the
+// sums of its positive and negative weights:
 //   bias + 256 (P + c) < 2^23   and   bias - 256 (N + c) >= -2^23
 // where c covers the roundings: z is less than 255 a column away from the exact products' sum.
 // Cost      two passes; on AVR about 100 cycles per byte of the image.

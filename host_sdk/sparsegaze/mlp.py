@@ -214,19 +214,21 @@ def activations(model, features):
 
 def sums(layer, a):
     """z of a layer as the device has them: int64 [n, r], 24 bits signed, modulo 2^24."""
+    return (whole_sums(layer, a) + Z_END) % (2 * Z_END) - Z_END
+
+
+def whole_sums(layer, a):
+    """The same before the modulo, which sg_mlp_open proves to do nothing."""
     a, half = np.asarray(a, np.int64), HALF[layer.weight_bytes]
     stored = layer.weights.astype(np.int64) + half
     total = a.sum(axis=1, keepdims=True)
     if layer.weight_bytes == 1:
         # every product loses its low byte
         products = (a @ stored.T - _low_bytes(a, stored)) >> 8
-        z = layer.bias - (total >> 1) + products
-    else:
-        # hi * a + lo * (a >> 8), exact in float64 far below 2^53
-        high, low = stored >> 8, stored & 255
-        products = _exact(a, high) + _exact(a >> 8, low)
-        z = layer.bias - 128 * total + ((a & 255).sum(axis=1, keepdims=True) >> 1) + products
-    return (z + Z_END) % (2 * Z_END) - Z_END
+        return layer.bias - (total >> 1) + products
+    # hi * a + lo * (a >> 8), exact in float64 far below 2^53
+    products = _exact(a, stored >> 8) + _exact(a >> 8, stored & 255)
+    return layer.bias - 128 * total + ((a & 255).sum(axis=1, keepdims=True) >> 1) + products
 
 
 def squash(z, scale):
@@ -354,6 +356,8 @@ def _opened(image):
         low, high = layer.range
         if np.any(high >= Z_END) or np.any(low < -Z_END):
             raise ModelError("a sum of this network could leave 24 bits on the device", _REFIT)
+        if np.any(layer.scale[r:]):
+            raise ModelError("the network has a row too many", _REFIT)
         layers.append(Layer(layer.weights[:r], layer.bias[:r], layer.scale[:r], int(b)))
         at += used
     return image, tuple(layers)

@@ -27,10 +27,10 @@ def filled_layer(rng, rows, columns, weight_bytes, typical):
     return Layer(weights, np.clip(bias, low, high), scale, weight_bytes)
 
 
-def random_model(rng, inputs, widths, outputs, weight_bytes):
+def random_model(rng, inputs, widths, outputs, weight_bytes, typical=TYPICAL_HIDDEN):
     """A network that is right in form, with wild content; weight_bytes: one for each layer."""
     shapes = list(zip([*widths, outputs], [inputs, *widths], weight_bytes))
-    layers = [filled_layer(rng, *shape, TYPICAL_HIDDEN) for shape in shapes[:-1]]
+    layers = [filled_layer(rng, *shape, typical) for shape in shapes[:-1]]
     layers.append(filled_layer(rng, *shapes[-1], TYPICAL_OUTPUT))
     return MlpModel.from_layers(rng.integers(0, 30000, inputs), rng.integers(700, 3000, inputs), layers)
 
@@ -45,7 +45,7 @@ def inputs_near(rng, model, n):
 def golden_case():
     """The network and inputs behind the golden checksum."""
     rng = np.random.default_rng(20260)
-    model = random_model(rng, 6, (16, 13, 5), 2, (2, 1, 2, 2))
+    model = random_model(rng, 6, (16, 13, 5), 2, (2, 1, 2, 2), typical=40000)
     return model, inputs_near(rng, model, 64)
 
 
