@@ -68,6 +68,7 @@ def quantise(network, features, weight_bytes="auto", limit=LIMIT, margin=MARGIN)
     x = np.clip(np.rint(np.asarray(features, float)), 0, 65535).astype(np.uint16)
     if x.ndim != 2 or x.shape[1] != len(network.mean) or not len(x):
         raise CalibrationError(f"features {x.shape} for {len(network.mean)} inputs", "give [n, d]")
+    x = x[np.lexsort(x.T)]  # the order of the rows must not matter, not even for rounding
     count = len(network.layers)
     with threadpool_limits(1):
         if weight_bytes != "auto":

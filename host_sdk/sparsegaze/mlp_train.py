@@ -92,13 +92,17 @@ def distil(gp, features, gaze_deg, widths=(16, 16), points=3000, noise=0.0, seed
     if x.ndim != 2 or gaze.shape != (len(x), 2) or not 2 <= len(x):
         shapes = f"features {x.shape} and gaze {gaze.shape} do not do"
         raise CalibrationError(shapes, "give [n, d] and [n, 2]")
+    order = np.lexsort(np.column_stack([gaze, x]).T)
+    x, gaze = x[order], gaze[order]
     rng = np.random.default_rng([0x636C64, seed])
     anchor = rng.integers(0, len(x), points)
     distance = np.sum((gaze[anchor, None] - gaze) ** 2, axis=2)
     near = np.argsort(distance, axis=1, kind="stable")[:, : min(NEIGHBOURS, len(x))]
     share = rng.dirichlet(np.full(near.shape[1], 0.5), points)
     cloud = np.einsum("ij,ijk->ik", share, x[near]) + rng.normal(0, 1, (points, x.shape[1])) * noise
-    return train(cloud, gp.predict(cloud), widths, seed=seed, **options)
+    with threadpool_limits(1):
+        labels = gp.predict(cloud)
+    return train(cloud, labels, widths, seed=seed, **options)
 
 
 def _check(x, y, widths, restarts, steps):

@@ -50,6 +50,14 @@ def test_result_is_the_same_whatever_the_order_of_the_rows_and_the_number_of_thr
     assert same(given, mlp_train.train(x[order], y[order], (6,), steps=60, held_out=held[order]))
 
 
+def test_distilled_network_is_the_same_whatever_the_order_of_the_rows():
+    x, y = waves(60)
+    gp = GaussianProcess.fit(x, y, mean="constant", restarts=0)
+    order = np.random.default_rng(5).permutation(len(x))
+    options = {"widths": (4,), "points": 200, "steps": 40, "restarts": 1}
+    assert same(mlp_train.distil(gp, x, y, **options), mlp_train.distil(gp, x[order], y[order], **options))
+
+
 def test_no_hidden_layer_is_least_squares():
     x, y = waves()
     held = np.zeros(len(x), bool)
