@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The peers' bench: float C on a simulated ATmega328P answers what numpy answers, and what does not fit the chip
-is told apart. The libraries themselves are not needed here."""
+"""The peers' bench: float C on a simulated ATmega328P answers what numpy answers, and what does not fit is told
+apart. The libraries themselves are not needed here."""
 
 import sys
 from pathlib import Path
@@ -62,7 +62,7 @@ def test_naive_float_c_answers_what_float32_in_numpy_does(data, workdir, kind):
     assert figures.fits and figures.reason == ""
     assert len(figures.rows) == len(data[2])
     assert np.abs(figures.gaze_deg - gp.predict(data[2])).max() < 1e-3
-    assert 150_000 < figures.cycles_min < figures.cycles_max < 190_000  # 32 calls of exp at 2,271 and the rest
+    assert 150_000 < figures.cycles_min < figures.cycles_max < 190_000  # 32 calls of exp() at 2,271
     assert 3000 < figures.flash < 5000 and 60 < figures.ram < 300
 
 

@@ -22,7 +22,7 @@ TRAINING_S = 900  # at most
 SETUP = "sh tools/bench/setup_bench.sh --without-llvm"
 
 
-def measure(name, calibration, held_out, truth_deg, gp_mean_deg, workdir, say=lambda text: None):
+def measure(name, calibration, held_out, truth_deg, gp_mean_deg, workdir, say=lambda text: None, spread=None):
     """Rows of the table of peers for one data set.
 
     name          of the data set
@@ -30,11 +30,13 @@ def measure(name, calibration, held_out, truth_deg, gp_mean_deg, workdir, say=la
     held_out      (features uint16 [m, d], target_deg [m, 2]); the targets are not used
     truth_deg     [m, 2] where the eye looked; gp_mean_deg [m, 2] the full float64 process's answer
     workdir       folder for what is generated and compiled; say: called with a line now and then
+    spread        (features [k, d], target_deg [k, 2]), more rows made of the calibration that peers may
+                  choose to be trained on, or None
 
-    Each row: name, version, dataset; cycles (of the slowest prediction) and cycles_min; flash, ram (static
-    and stack) in bytes; truth_mean_deg, rms_to_gp_deg (angles between directions; of the chip's own answers, of
-    scikit-learn's on the host);
-    fits (the Nano, and ran there); note (settings, and why it does not fit). None where there is no figure.
+    Each row: name, version, dataset; cycles (of the slowest prediction) and cycles_min; flash, ram (static,
+    stack) in bytes; truth_mean_deg, rms_to_gp_deg (angles between directions; of the chip's own answers, of
+    scikit-learn's on the host); fits: the Nano holds it; note (settings, and why it does not fit). None where
+    there is no figure.
     The host's row also has fit_s, lml and rows. Without .venv-bench there is one row, which says so.
     """
     missing = avr_program.missing() or ("" if PYTHON.is_file() else f"peers are not installed: {SETUP}")
@@ -51,6 +53,7 @@ def measure(name, calibration, held_out, truth_deg, gp_mean_deg, workdir, say=la
         held_out=features,
         truth_deg=truth_deg,
         gp_mean_deg=gp_mean_deg,
+        **({} if spread is None else {"spread": spread[0], "spread_deg": spread[1]}),
     )
     trained = _train(workdir / "in.npz", workdir / "out.json")
     rows = []
@@ -143,7 +146,8 @@ def main(arguments):
     given, made = arguments
     with np.load(given) as data:
         arrays = [data[k] for k in ("features", "target_deg", "held_out", "truth_deg", "gp_mean_deg")]
-    candidate.write(trained.train(*arrays, say=lambda text: print(text, flush=True)), made)
+        spread = (data["spread"], data["spread_deg"]) if "spread" in data.files else None
+    candidate.write(trained.train(*arrays, spread, lambda text: print(text, flush=True)), made)
 
 
 if __name__ == "__main__":

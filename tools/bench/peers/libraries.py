@@ -21,12 +21,15 @@ from sklearn.svm import SVR
 
 from .candidate import Candidate, scaling
 
-SVR_ROWS = 600  # its cost grows with their square and more
-SVR_CHOICES = tuple(product((100.0, 1000.0, 5000.0), (0.05, 0.15, 0.4)))  # C, gamma
-SVR_TUBES_DEG = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
-SVR_VECTORS_FIT = 68  # of both outputs: at 390 bytes of code each, what 30 KB hold
+SVR_ROWS, SVR_JUDGED = 600, 400  # its cost grows with their square and more
+SVR_CHOICES = (100.0, 1000.0, 5000.0), (0.05, 0.15, 0.4)  # C, gamma
+SVR_TUBES_DEG = (0.05, 0.2, 0.5)
+SVR_WIDEST_DEG, SVR_HALVINGS = 8.0, 7
+SVR_EXPORTED = 300  # of one output: m2cgen recurses for each vector, up to Python's limit
+SVR_VECTORS_FIT = 72  # of both outputs: at 400 bytes of code each, what 30 KB hold
 NETWORKS = (((16,), "tanh"), ((16,), "relu"), ((16, 16), "tanh"), ((16, 16), "relu"))
-MLP_ROWS, MLP_ALPHAS, MLP_SEEDS, MLP_STEPS = 800, (1e-5, 1e-3, 1e-1), 2, (400, 2000)
+MLP_ROWS, MLP_SEEDS, MLP_STEPS = 1000, 3, 1000
+MLP_DECAYS = (5e-5, 2e-6, 5e-4)
 FORESTS = ((1, 40), (1, 120), (1, 300), (3, 110), (6, 55), (10, 32))  # trees, leaves: what 30 KB hold
 WRAPPED = """#include "peer.h"
 
@@ -46,87 +49,89 @@ TREE_SCALE = "for (uint8_t j = 0; j < PEER_CHANNELS; j++) x[j] = feature[j]"
 
 def m2cgen_svr(calibration, held_out):
     """SVR with the best error, and the best that fits the flash; one function of C for each output."""
-    c, rows = calibration, calibration.at_most(SVR_ROWS)
-    few = type(c)(c.features[rows], c.target_deg[rows], c.seed)
-    few.origin, few.spread = c.origin, c.spread
-    x = few.standard(few.features)
+    c = calibration
 
     def pair(x, y, cost, gamma, tube):
-        return [SVR(C=cost, gamma=gamma, epsilon=tube).fit(x, y[:, o]) for o in (0, 1)]
+        return [SVR(C=cost, gamma=gamma, epsilon=tube).fit(c.standard(x), y[:, o]) for o in (0, 1)]
 
-    def judge(cost, gamma, tube):
-        return few.validation_error(lambda x, y: _stacked(pair(x, y, cost, gamma, tube)), x)
+    def make(x, y, *choice):
+        models = pair(x, y, *choice)
+        return lambda q: _stacked(models)(c.standard(q))
 
-    def best(tube):
-        errors = [judge(*choice, tube) for choice in SVR_CHOICES]
-        return min(errors), SVR_CHOICES[int(np.argmin(errors))]
+    def chosen(costs, tubes, names=None):
+        return c.best(make, list(product(*costs, tubes)), SVR_JUDGED, 2, names)
 
-    _, choice = best(0.3)
-    tube = min(SVR_TUBES_DEG[:6], key=lambda tube: judge(*choice, tube))
-    made = [_svr(c, held_out, pair(x, few.target_deg, *choice, tube), (*choice, tube), "best error")]
-    for tube in SVR_TUBES_DEG:
-        models = pair(x, few.target_deg, *choice, tube)
-        if sum(len(m.support_) for m in models) <= SVR_VECTORS_FIT:
-            _, choice = best(tube)
-            models = pair(x, few.target_deg, *choice, tube)
-            made.append(_svr(c, held_out, models, (*choice, tube), "small enough"))
-            break
-    return made
+    def trained(name, choice):
+        return pair(*c.rows(name, SVR_ROWS), *choice)
+
+    name, choice = chosen(SVR_CHOICES, SVR_TUBES_DEG[1:2])
+    name, choice = chosen([[v] for v in choice[:2]], SVR_TUBES_DEG, [name])
+    made = [_svr(c, held_out, trained(name, choice), name, choice, "best error")]
+    for _ in range(2):  # the tube that leaves few enough vectors, then what suits that tube
+        low, high = SVR_TUBES_DEG[0], SVR_WIDEST_DEG
+        for _ in range(SVR_HALVINGS):
+            tube = float(np.sqrt(low * high))
+            count = sum(len(m.support_) for m in trained(name, (*choice[:2], tube)))
+            low, high = (low, tube) if count <= SVR_VECTORS_FIT else (tube, high)
+        small = name, (*choice[:2], high)
+        name, choice = chosen(SVR_CHOICES, [high], [name])
+    return [*made, _svr(c, held_out, trained(*small), *small, "small enough")]
 
 
-def _svr(calibration, held_out, models, choice, why):
-    names = ("svr_azimuth", "svr_elevation")
+def _svr(calibration, held_out, models, name, choice, why):
+    names, title = ("svr_azimuth", "svr_elevation"), f"m2cgen SVR, {why}"
+    counts = [len(m.support_) for m in models]
+    note = "RBF, C {:g}, gamma {:g}, epsilon {:.3g} deg; ".format(*choice)
+    note += f"{counts[0]} + {counts[1]} support vectors, trained on {name}"
+    predicted = _stacked(models)(calibration.standard(held_out))
+    if max(counts) > SVR_EXPORTED:
+        note += f"; too many for m2cgen itself, which recurses ({SVR_EXPORTED} are not); the PC's error"
+        return Candidate(title, _version("m2cgen"), note, predicted=predicted)
     sources = {f"{n}.c": m2cgen.export_to_c(m, function_name=n) for n, m in zip(names, models, strict=True)}
     sources["peer.c"] = WRAPPED.format(
-        scaling=scaling(calibration.origin, 1 / calibration.spread, "double"),
+        scaling=scaling(calibration.origin, 1 / calibration.deviation, "double"),
         declare="".join(f"double {n}(double *);\n" for n in names),
         type="double",
         scale="peer_scale(feature, x)",
         azimuth="svr_azimuth(x)",
         elevation="svr_elevation(x)",
     )
-    count = " + ".join(str(len(m.support_)) for m in models)
-    note = "RBF, C {:g}, gamma {:g}, epsilon {:g} deg; ".format(*choice) + f"{count} support vectors"
-    predicted = _stacked(models)(calibration.standard(held_out))
-    return Candidate(f"m2cgen SVR, {why}", _version("m2cgen"), note, sources, (), predicted)
+    return Candidate(title, _version("m2cgen"), note, sources, (), predicted)
 
 
 def emlearn_networks(calibration, held_out):
     """Multilayer perceptrons in float."""
-    c, rows, made = calibration, calibration.at_most(MLP_ROWS), []
-    y = (c.target_deg - c.target_deg.mean(axis=0)) / c.level_deg
-    x, middle = c.standard(c.features), c.target_deg.mean(axis=0)
-    few = type(c)(c.features[rows], c.target_deg[rows], c.seed)
+    c, made = calibration, []
 
-    def network(layers, kind, alpha, seed, steps, x, y):
+    def network(x, y, layers, kind, decay, seed):
         return MLPRegressor(
             hidden_layer_sizes=layers,
             activation=kind,
-            alpha=alpha,
+            alpha=decay * len(x),  # scikit-learn divides it by the number of samples
             solver="lbfgs",
-            max_iter=steps,
-            max_fun=10 * steps,
+            max_iter=MLP_STEPS,
+            max_fun=10 * MLP_STEPS,
             tol=1e-9,
             random_state=seed,
-        ).fit(x, y)
+        ).fit(c.standard(x), (y - c.middle_deg) / c.level_deg)
 
+    def make(x, y, layers, kind, decay):
+        model = network(x, y, layers, kind, decay, 0)
+        return lambda q: model.predict(c.standard(q)) * c.level_deg + c.middle_deg
+
+    name, _ = c.best(make, [(*NETWORKS[0], MLP_DECAYS[0])], MLP_ROWS, 2)
     for layers, kind in NETWORKS:
-
-        def judged(alpha, layers=layers, kind=kind):
-            def make(x, y):
-                model = network(layers, kind, alpha, 0, MLP_STEPS[0], x, (y - middle) / c.level_deg)
-                return lambda q: model.predict(q) * c.level_deg + middle
-
-            return few.validation_error(make, x[rows], few.folds[:2])
-
-        alpha = min(MLP_ALPHAS, key=judged)
-        tries = [network(layers, kind, alpha, seed, MLP_STEPS[1], x, y) for seed in range(MLP_SEEDS)]
+        choices = [(layers, kind, decay) for decay in MLP_DECAYS]
+        _, (*_, decay) = c.best(make, choices, MLP_ROWS, 2, [name])
+        rows = c.rows(name)
+        tries = [network(*rows, layers, kind, decay, seed) for seed in range(MLP_SEEDS)]
         model = min(tries, key=lambda m: m.loss_)
-        predicted = model.predict(c.standard(held_out)) * c.level_deg + middle
-        shape = "-".join(str(n) for n in (x.shape[1], *layers, 2))
-        note = f"L-BFGS, alpha {alpha:g}, best training loss of {MLP_SEEDS} starts; weights stay in SRAM"
+        shape = "-".join(str(n) for n in (len(c.origin), *layers, 2))
+        note = f"L-BFGS, alpha {decay:g} a sample, best training loss of {MLP_SEEDS} starts, "
+        note += f"trained on {name}; weights stay in SRAM"
         model.coefs_[-1] = model.coefs_[-1] * c.level_deg  # the last layer answers in degrees
-        model.intercepts_[-1] = model.intercepts_[-1] * c.level_deg + middle
+        model.intercepts_[-1] = model.intercepts_[-1] * c.level_deg + c.middle_deg
+        predicted = model.predict(c.standard(held_out))
         made.append(_network(c, model, f"emlearn MLP {shape} {kind}", note, predicted))
     return made
 
@@ -136,7 +141,7 @@ def _network(calibration, model, name, note, predicted):
     text = f"""#include "peer.h"
 #include "net.h"
 
-{scaling(calibration.origin, 1 / calibration.spread)}
+{scaling(calibration.origin, 1 / calibration.deviation)}
 void peer_predict(const uint16_t *feature, float *gaze_deg)
 {{
     float x[PEER_CHANNELS];
@@ -195,10 +200,11 @@ def micromlgen_trees(calibration, held_out):
     return [Candidate("micromlgen tree", _version("micromlgen"), note, sources, (), predicted)]
 
 
-def micromlgen_refuses(calibration):
+def micromlgen_refuses(calibration, _held_out):
     """What micromlgen says to the models that suit this task."""
     c = calibration
-    x, y = c.standard(c.features)[c.at_most(60)], c.target_deg[c.at_most(60), 0]
+    x, y = c.rows("frames", 60)
+    x, y = c.standard(x), y[:, 0]
     said = {}
     for model in (GaussianProcessRegressor(), KernelRidge(), SVR(), MLPRegressor(max_iter=5)):
         try:
@@ -212,22 +218,25 @@ def micromlgen_refuses(calibration):
 def _forest(calibration, held_out, choices, halve):
     """(models of both outputs, note, predicted): trees and leaves by cross-validation."""
     c = calibration
-    quantise = (lambda f: np.floor(np.asarray(f) / 2)) if halve else np.asarray
+
+    def quantise(features):
+        return np.rint(np.asarray(features)) // (2 if halve else 1)
 
     def pair(x, y, trees, leaves):
         return [
             RandomForestRegressor(trees, max_leaf_nodes=leaves, bootstrap=trees > 1, random_state=c.seed).fit(
-                x, y[:, o]
+                quantise(x), y[:, o]
             )
             for o in (0, 1)
         ]
 
-    x = quantise(c.features)
-    trees, leaves = min(
-        choices, key=lambda f: c.validation_error(lambda x, y: _stacked(pair(x, y, *f)), x)
-    )
-    models = pair(x, c.target_deg, trees, leaves)
-    note = f"{trees} x {leaves} leaves at most for each output"
+    def make(x, y, *choice):
+        models = pair(x, y, *choice)
+        return lambda q: _stacked(models)(quantise(q))
+
+    name, (trees, leaves) = c.best(make, choices)
+    models = pair(*c.rows(name), trees, leaves)
+    note = f"{trees} x {leaves} leaves at most for each output, trained on {name}"
     return models, note, _stacked(models)(quantise(held_out))
 
 

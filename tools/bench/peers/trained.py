@@ -6,7 +6,10 @@ Candidate too, with its own words.
 """
 
 import importlib.metadata
+import time
+import traceback
 import warnings
+from itertools import product
 
 import numpy as np
 
@@ -16,6 +19,7 @@ from .polynomial import Polynomial
 from .training import Calibration
 
 CENTRES = (32, 64, 128)
+LONGER, NOISIER = (1.0, 1.5, 2.0), (0.5, 1.0, 2.0, 4.0)  # times scikit-learn's: few centres differ
 LADDER = (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768)  # N, for equal error
 EQUAL_ERROR = 1.05  # of the full process's error to the truth: the project's own bar
 DEGREES = (2, 3, 4)
@@ -26,60 +30,72 @@ UNUSED = (
 )
 
 
-def train(features, target_deg, held_out, truth_deg, gp_mean_deg, say=lambda text: None):
+def train(features, target_deg, held_out, truth_deg, gp_mean_deg, spread=None, say=lambda text: None):
     """Candidates for a calibration (features [n, d], target_deg [n, 2]) asked at held_out [m, d].
 
     truth_deg, gp_mean_deg [m, 2] decide one thing only, in favour of the peer: which number of centres
-    naive float C needs for the full process's error.
+    naive float C needs for the full process's error. spread: more rows to train on (training.Calibration)
     """
-    calibration = Calibration(features, target_deg)
+    calibration = Calibration(features, target_deg, spread)
     held_out = np.asarray(held_out, float)
     made = []
     with warnings.catch_warnings(), np.errstate(all="ignore"):  # emlearn makes numpy raise on underflow
         warnings.simplefilter("ignore")  # optimisers that stop early say so; their errors are in the table
-        for build in (
-            lambda: naive(calibration, held_out, truth_deg, gp_mean_deg),
-            lambda: polynomials(calibration, held_out),
-            lambda: libraries.m2cgen_svr(calibration, held_out),
-            lambda: libraries.emlearn_networks(calibration, held_out),
-            lambda: libraries.emlearn_trees(calibration, held_out),
-            lambda: libraries.micromlgen_trees(calibration, held_out),
-            lambda: libraries.micromlgen_refuses(calibration),
-            lambda: host(calibration, held_out),
+        for build, *more in (
+            (naive, truth_deg, gp_mean_deg),
+            (polynomials,),
+            (libraries.m2cgen_svr,),
+            (libraries.emlearn_networks,),
+            (libraries.emlearn_trees,),
+            (libraries.micromlgen_trees,),
+            (libraries.micromlgen_refuses,),
+            (host,),
         ):
-            found = build()
+            began = time.perf_counter()
+            try:
+                found = build(calibration, held_out, *more)
+            except Exception as error:  # a library that fails on this calibration is a row, not the end
+                say(traceback.format_exc())
+                found = [Candidate(build.__name__, "-", f"failed: {type(error).__name__}: {error}"[:300])]
             made += found
-            say(", ".join(c.name for c in found))
+            say(f"{time.perf_counter() - began:.1f} s: {', '.join(c.name for c in found)}")
     return made + [Candidate(*row) for row in UNUSED]
 
 
 def naive(calibration, held_out, truth_deg, gp_mean_deg):
     """Float C with exp(): a process on a subset, and the best weights for the same centres."""
-    gp = calibration.gp
-    settings = gp.length, gp.signal_deg, gp.noise_deg
-    known = calibration.features, calibration.target_deg
+    c, gp = calibration, calibration.gp
+    made, equal = [], None
 
-    def candidate(n, kind, why=""):
-        model = float_gp.fit(*known, n, *settings, kind)
-        note = f"{kind}: {len(model.centre)} centres spread evenly, scikit-learn's hyper-parameters{why}"
-        name = f"naive float C, {kind}, N={len(model.centre)}"
-        return Candidate(name, "-", note, {"peer.c": model.source()}, (), model.predict(held_out))
+    def fit(x, y, kind, n, longer, noisier):
+        return float_gp.fit(x, y, n, longer * gp.length, gp.signal_deg, noisier * gp.noise_deg, kind)
 
-    most = len(calibration.features)
-    made = [candidate(n, kind) for kind in ("subset", "inducing") for n in CENTRES if n <= most]
+    def candidate(kind, n, name, choice):
+        model = fit(*c.rows(name), *choice)
+        longer, noisier = choice[2:]
+        note = f"{len(model.centre)} centres spread evenly, trained on {name}, "
+        note += f"scikit-learn's length scales x {longer:g} and noise x {noisier:g}"
+        title = f"naive float C, {kind}, N={len(model.centre)}"
+        return Candidate(title, "-", note, {"peer.c": model.source()}, (), model.predict(held_out))
+
+    def chosen(kind, n):
+        choices = [(kind, n, longer, noisier) for longer, noisier in product(LONGER, NOISIER)]
+        return c.best(lambda x, y, *choice: fit(x, y, *choice).predict, choices)
+
+    for kind, n in product(("subset", "inducing"), CENTRES):
+        if n <= len(c.features):
+            made.append(candidate(kind, n, *chosen(kind, n)))
     bar = EQUAL_ERROR * mean_miss(gp_mean_deg, truth_deg)
-    equal = None
-    for n in [n for n in LADDER if n < most] + [most] * (most <= LADDER[-1]):
-        equal = candidate(n, "inducing")
+    name, choice = chosen("inducing", min(CENTRES[1], len(c.features)))
+    for n in [n for n in LADDER if n <= max(len(x) for x, *_ in c.sets.values())]:
+        equal = candidate("inducing", n, name, ("inducing", n, *choice[2:]))
         if mean_miss(equal.predicted, truth_deg) <= bar:
-            equal.name += ", equal error"
             equal.note += f"; the least N with at most {EQUAL_ERROR} times the full process's error"
             break
     else:
-        if equal is not None:
-            equal.note += f"; no N has at most {EQUAL_ERROR} times the full process's error"
-    known_names = {c.name for c in made}
-    return made + [equal] * (equal is not None and equal.name not in known_names)
+        equal.note += f"; no N has at most {EQUAL_ERROR} times the full process's error"
+    equal.name = "naive float C, equal error" + equal.name[equal.name.rindex(","):]
+    return [*made, equal]
 
 
 def polynomials(calibration, held_out):
@@ -88,25 +104,29 @@ def polynomials(calibration, held_out):
     for degree in DEGREES:
 
         def fit(x, y, ridge, degree=degree):
-            return Polynomial.fit(x, y, degree, ridge, c.origin, 1 / c.spread)
+            return Polynomial.fit(x, y, degree, ridge, c.origin, 1 / c.deviation)
 
-        errors = [c.validation_error(lambda x, y, r=r: fit(x, y, r).predict, c.features) for r in RIDGES]
-        ridge = RIDGES[int(np.argmin(errors))]
-        model = fit(c.features, c.target_deg, ridge)
-        note = f"Horner's form, {len(model.terms)} terms, ridge {ridge:g}"
-        name = f"polynomial ridge, degree {degree}, float C"
-        made.append(Candidate(name, "-", note, {"peer.c": model.source()}, (), model.predict(held_out)))
+        name, (ridge,) = c.best(lambda *a, fit=fit: fit(*a).predict, [(r,) for r in RIDGES])
+        model = fit(*c.rows(name), ridge)
+        note = f"Horner's form, {len(model.terms)} terms, ridge {ridge:g}, trained on {name}"
+        title = f"polynomial ridge, degree {degree}, float C"
+        made.append(Candidate(title, "-", note, {"peer.c": model.source()}, (), model.predict(held_out)))
     return made
 
 
 def host(calibration, held_out):
     """scikit-learn's process on the computer."""
     gp = calibration.gp
-    note = f"runs on the host only: {gp.rows} samples, ARD-RBF and white noise by marginal likelihood"
-    figures = {"fit_s": gp.fit_s, "lml": gp.lml, "rows": gp.rows}
+    x, y = calibration.rows(gp.name)
+    began = time.perf_counter()
+    process = gp.process(x, y)
+    solve_s = time.perf_counter() - began
+    note = f"runs on the host only: ARD-RBF and white noise by marginal likelihood of {gp.rows} samples, "
+    note += f"then given {len(x)}; trained on {gp.name}"
+    figures = {"fit_s": gp.fit_s + solve_s, "lml": gp.lml, "rows": gp.rows}
     version = importlib.metadata.version("scikit-learn")
     name = "scikit-learn GaussianProcessRegressor"
-    return [Candidate(name, version, note, {}, (), gp.predict(held_out), figures)]
+    return [Candidate(name, version, note, {}, (), process(held_out), figures)]
 
 
 def mean_miss(a, b):
