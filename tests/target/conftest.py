@@ -22,10 +22,10 @@ def random_model(vectors, seed=0, generation=1, channels=CHANNELS):
     Its inputs span features 30000 .. 40000 about.
     """
     rng = np.random.default_rng(seed)
-    trust = Trust(row=rng.integers(-60, 60, (3, channels)), base=np.full(3, -1000), low=np.full(3, -1024),
-                  high=np.full(3, 1024), expected=rng.integers(0, 256, (3, 3, 3)),
+    trust = Trust(row=rng.integers(-2, 3, (3, channels)), base=np.full(3, -1000), low=np.full(3, -1024),
+                  high=np.full(3, 1024), expected=rng.integers(80, 170, (3, 3, 3)),
                   sigma=rng.integers(60, 140, (3, 3)), origin_deg_q7=np.full(2, -2560), scale=np.full(2, 30),
-                  limit=40000, sigma_gain=3)
+                  limit=45000, sigma_gain=3)
     return DeviceModel.from_parts(
         offset=rng.integers(30000, 31000, channels), gain_q12=rng.integers(1500, 1700, channels),
         bias=rng.integers(-2**24, 2**24, 2), trend=rng.integers(-2**10, 2**10, (2, channels)),
@@ -41,7 +41,7 @@ def costly_model(middle, vectors=64, seed=0):
     the middle, and every guard passes there, so that all are computed.
     """
     rng = np.random.default_rng(seed)
-    trust = Trust(row=rng.integers(-127, 128, (4, CHANNELS)), base=np.full(4, -1000), low=np.full(4, -2**15),
+    trust = Trust(row=rng.integers(-10, 11, (4, CHANNELS)), base=np.full(4, -1000), low=np.full(4, -2**15),
                   high=np.full(4, 2**15 - 1), expected=rng.integers(0, 256, (9, 9, 4)),
                   sigma=rng.integers(60, 140, (9, 9)), origin_deg_q7=np.full(2, -2560), scale=np.full(2, 100),
                   limit=65535, sigma_gain=3)

@@ -6,7 +6,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from budget import judge_all, read
+from budget import judge_all
 from conftest import collect, costly_model, random_features, random_model
 
 from sparsegaze.model import FLAG_OUT_OF_RANGE, kernel_q16, quantise
@@ -18,12 +18,6 @@ STACK_LEAST_FREE = 100
 # What an interrupt costs outside of its markers, at most: entry, jump, 13 registers and flags saved, return.
 ISR_EDGES_CYCLES = 90
 SECTIONS = {"infer": "0", "feature": "1", "output": "2", "sense_isr": "3", "serial_isr": "4", "frame": "5"}
-
-
-@pytest.fixture(scope="module")
-def budget():
-    """tests/budget.csv for this target."""
-    return read(TARGET)
 
 
 @pytest.fixture
@@ -44,7 +38,7 @@ def costly(board, tmp_path):
     return nano, device, model
 
 
-def test_cycles_of_every_section_while_the_costliest_ordinary_model_streams(costly, budget):
+def test_cycles_of_every_section_while_the_costliest_ordinary_model_streams(costly):
     nano, device, model = costly
     frames = collect(device, 400)
     features = np.array([frame.raw.feature for frame in frames])
@@ -62,7 +56,7 @@ def test_cycles_of_every_section_while_the_costliest_ordinary_model_streams(cost
           f"with interrupts a frame's work took at most {sections['5'].most:.0f} cycles")
     assert busy < 0.70 * FRAME_CYCLES and sections["5"].most < 0.70 * FRAME_CYCLES
     assert device.status().late_frames == 0
-    judge_all(budget, [(name, "cycles_max", int(section.most)) for name, section in net.items()])
+    judge_all(TARGET, [(name, "cycles_max", int(section.most)) for name, section in net.items()])
 
 
 def test_inference_takes_the_same_time_for_every_input_inside_the_range(board):
@@ -77,7 +71,7 @@ def test_inference_takes_the_same_time_for_every_input_inside_the_range(board):
     assert infer.most - infer.least <= 0.03 * infer.most
 
 
-def test_stack_beside_the_static_data_after_everything_was_used(board, budget, avr_tools, firmware_elf):
+def test_stack_beside_the_static_data_after_everything_was_used(board, avr_tools, firmware_elf):
     static = static_ram(avr_tools, firmware_elf)
     model = random_model(64)
     nano, device = board(models={0: model.image, 1: random_model(216, generation=0).image})
@@ -93,16 +87,16 @@ def test_stack_beside_the_static_data_after_everything_was_used(board, budget, a
     used = RAM_BYTES - static - free
     print(f"static {static} B, stack used {used} B of {RAM_BYTES - static}, never touched {free} B")
     assert RAM_BYTES - static >= 300 and free >= STACK_LEAST_FREE
-    judge_all(budget, [("firmware", "stack", used)])
+    judge_all(TARGET, [("firmware", "stack", used)])
 
 
-def test_flash_and_ram_of_the_shipped_binary(avr_tools, firmware_elf, budget):
+def test_flash_and_ram_of_the_shipped_binary(avr_tools, firmware_elf):
     sizes = section_sizes(avr_tools, firmware_elf)
     flash = sizes[".text"] + sizes[".data"]
     print(f"flash {flash} B of 24576, static RAM {static_ram(avr_tools, firmware_elf)} B of {RAM_BYTES}")
     assert flash <= 0x6000
     ram = static_ram(avr_tools, firmware_elf)
-    judge_all(budget, [("firmware", "flash", flash), ("firmware", "ram", ram)])
+    judge_all(TARGET, [("firmware", "flash", flash), ("firmware", "ram", ram)])
 
 
 def test_nothing_of_the_binary_lies_in_the_model_slots(avr_tools, firmware_elf):

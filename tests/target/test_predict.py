@@ -6,6 +6,8 @@ import json
 import math
 import os
 import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -173,6 +175,24 @@ def test_a_reboot_ends_qemu_and_is_noticed():
     with qemu.QemuBoard() as board, Device(board) as device:
         with pytest.raises(DisconnectedError, match="the program in it ended"):
             device.reboot()
+
+
+def test_ctrl_c_ends_qemu_and_leaves_nothing_behind(tmp_path):
+    random_model(64).save(tmp_path / "m.sgm")
+    Recording(np.arange(50000), random_features(50000), np.zeros((50000, 2)), np.ones(50000)).write(
+        tmp_path / "r.csv")
+    left = tmp_path / "t"
+    left.mkdir()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sparsegaze.cli", "predict", str(tmp_path / "m.sgm"), str(tmp_path / "r.csv"),
+         "--on", "cortex-m4", "--json"], env={**os.environ, "TMPDIR": str(left)}, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True)
+    assert "predicting" in process.stderr.readline()
+    assert list(left.iterdir())
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 130 and json.loads(out)["error"] == "interrupted"
+    assert list(left.iterdir()) == []
 
 
 def test_a_record_with_a_part_missing_is_refused(tmp_path):
