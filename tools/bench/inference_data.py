@@ -285,10 +285,11 @@ def make(wanted, folder=FOLDER, jobs=2, say=print):
     stale = [name for name in wanted if not is_current(folder / name, name)]
     began, done = time.perf_counter(), 0
     if stale:
-        say(
-            f"{len(wanted) - len(stale)} of {len(wanted)} sets are there; making {len(stale)}, about "
-            "80 s of one core a person whose response map is not in the cache, else 15 s"
+        mapped = sum(kind_of(name) == "simulated" for name in stale)
+        cost = (
+            f", {mapped} of persons: 80 s of one core each whose response map is not in the cache, else 15 s"
         )
+        say(f"{len(stale)} of {len(wanted)} sets to make" + (cost if mapped else ""))
     for name, seconds in _in_turn(folder, stale, jobs):
         done += 1
         left = (time.perf_counter() - began) / done * (len(stale) - done)
