@@ -33,7 +33,7 @@ COMMANDS = {
     "predict": ("cli_predict", "A model's answers from a target's own binary, with its cycles."),
     "upload": ("cli_device", "Put a model into the device, safe against power cuts."),
     "validate": ("cli_gaze", "Measure the device's gaze on held-out targets."),
-    "recentre": ("cli_gaze", "Put a shifted headset right with one look at the centre."),
+    "recentre": ("cli_recentre", "Put a shifted headset right with one look at the centre, or a few."),
     "stream": ("cli_stream", "The gaze computed on the device, live."),
     "replay": ("cli_stream", "The device's arithmetic on the host, over a recording, to the bit."),
 }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands with targets: calibrate, record, fit, validate, recentre."""
+"""Commands with targets: calibrate, record, fit, validate; cli_recentre has recentre."""
 
 import contextlib
 import os
@@ -37,12 +37,12 @@ def screen_options(command):
     return command
 
 
-def _window(distance_mm, width_mm, windowed):
+def window_of(distance_mm, width_mm, windowed):
     return {"distance_mm": distance_mm, "width_mm": width_mm, "full_screen": not windowed}
 
 
 @contextlib.contextmanager
-def _screen(device, window):
+def open_screen(device, window):
     from .screen import screen_for
 
     shown = screen_for(device, **window)
@@ -145,7 +145,7 @@ def calibrate(port, n_targets, vectors, n_validation, seed, save, distance_mm, w
                 seed,
                 n_validation,
                 folder,
-                window=_window(distance_mm, width_mm, windowed),
+                window=window_of(distance_mm, width_mm, windowed),
                 progress=progress,
             )
     except BaseException as error:
@@ -196,7 +196,7 @@ def record(port, output, n_targets, seed, distance_mm, width_mm, windowed, as_js
     from .fixations import TARGETS_NEEDED
 
     console = Console(as_json)
-    with Device(port) as device, _screen(device, _window(distance_mm, width_mm, windowed)) as shown:
+    with Device(port) as device, open_screen(device, window_of(distance_mm, width_mm, windowed)) as shown:
         plan = targets.calibration_plan(n_targets, seed, reach_deg=shown.reach_deg())
         meta = {"device": device.hello.board_text, "firmware": device.hello.firmware_text, "plan_seed": seed}
         with console.progress() as progress:
@@ -317,7 +317,7 @@ def validate(port, n_targets, seed, csv, png, distance_mm, width_mm, windowed, a
     console = Console(as_json)
     with console.progress() as progress:
         done = module.run(
-            port, n_targets, seed, window=_window(distance_mm, width_mm, windowed), csv=csv, progress=progress
+            port, n_targets, seed, window=window_of(distance_mm, width_mm, windowed), csv=csv, progress=progress
         )
     report, rows = done.report(), done.per_target()
     if png:
@@ -345,50 +345,9 @@ def validate(port, n_targets, seed, csv, png, distance_mm, width_mm, windowed, a
     return 0 if done.bit_identical else 1
 
 
-@click.command()
-@port_argument
-@click.option("--clear", is_flag=True, help="Take the offset away instead.")
-@screen_options
-@json_option
-def recentre(port, clear, distance_mm, width_mm, windowed, as_json):
-    """Put a shifted headset right: look at the centre for two seconds, and the gaze there becomes (0, 0).
-
-    The offset, in degrees, is kept in the device and added to every gaze until --clear or the next recentre.
-
-    \b
-    Example:
-        sparsegaze recentre /dev/ttyUSB0
-    """
-    from . import recentre as module
-    from .device import Device
-
-    console = Console(as_json)
-    with Device(port) as device:
-        if clear:
-            before = device.recentre()
-            after = module.keep(device)
-            data = {
-                "before_deg": [before.azimuth_deg, before.elevation_deg],
-                "after_deg": [after.azimuth_deg, after.elevation_deg],
-            }
-            console.result(data, "offset was %+.2f %+.2f deg, is 0 now" % tuple(data["before_deg"]))
-            return
-        with (
-            _screen(device, _window(distance_mm, width_mm, windowed)) as shown,
-            console.progress() as progress,
-        ):
-            report = module.run(device, shown, progress=progress)
-    console.result(
-        report._asdict(),
-        "gaze was %+.2f %+.2f deg at the centre" % report.gaze_deg,
-        "offset %+.2f %+.2f deg" % report.before_deg + ", now %+.2f %+.2f deg" % report.after_deg,
-    )
-
-
 COMMANDS = {
     "calibrate": calibrate,
     "record": record,
     "fit": fit,
     "validate": validate,
-    "recentre": recentre,
 }
