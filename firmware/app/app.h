@@ -17,6 +17,8 @@
 // Not inlined: everything ends up in main() otherwise, and what a function has on the stack stays there while
 // others, later, go deeper.
 #define NOT_KEPT __attribute__((noinline))
+// The same for what runs seldom: compiled for size.
+#define SELDOM __attribute__((noinline, cold))
 
 #define APP_FIRMWARE_VERSION 0x000100UL      // product version, major minor patch: 0.1.0
 

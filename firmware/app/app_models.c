@@ -167,7 +167,7 @@ int8_t app_trial_write(const struct sg_model_data *data)
     return SG_OK;
 }
 
-NOT_KEPT static void check_on(void)
+SELDOM static void check_on(void)
 {
     const uint8_t *image = slot_image(check.slot);
     const uint8_t space = slot_space(check.slot);

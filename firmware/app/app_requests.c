@@ -144,7 +144,7 @@ static int8_t trial_write(uint8_t n)
 }
 
 // `body` holds the n bytes of the request, and then its answer.
-NOT_KEPT static void request(const struct sg_head *head, uint8_t n, uint32_t arrived_us)
+SELDOM static void request(const struct sg_head *head, uint8_t n, uint32_t arrived_us)
 {
     uint8_t answer_bytes = 0;
     int8_t result = SG_OK;

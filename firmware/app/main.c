@@ -54,7 +54,7 @@ static uint8_t exposures_changed(const struct hal_frame *frame)
     return changed ? SG_FLAG_EXPOSURE : 0;
 }
 
-NOT_KEPT static void expose_next(const struct hal_frame *frame)
+SELDOM static void expose_next(const struct hal_frame *frame)
 {
     uint16_t exposure[HAL_CHANNELS];
     uint8_t changed = 0;
@@ -154,7 +154,7 @@ void app_describe(struct sg_hello *hello)
     hello->channels = HAL_CHANNELS;
 }
 
-NOT_KEPT static void start(void)
+SELDOM static void start(void)
 {
     uint16_t exposure[HAL_CHANNELS];
     struct sg_hello hello;
