@@ -38,7 +38,7 @@ help: ## this list
 setup: ## install what is missing: Debian packages (when root or sudo), .venv with pinned packages
 	@sh tools/setup.sh
 
-firmware: setup build/firmware/cortex-m4.elf ## build the firmware for the Nano and for QEMU's Cortex-M4, check the links, put the Nano's hex into the Python package
+firmware: setup build/firmware/cortex-m4.elf ## build the firmware for the Nano and for a Cortex-M4 in QEMU, check their links, put the hex into the Python package
 	@$(PY) tools/pio_offline.py run -s -e nano
 	@$(PY) tools/check_link.py $(PIO)/firmware.elf
 	@mkdir -p build/firmware $(dir $(HEX))

@@ -40,7 +40,8 @@ class QemuBoard:
 
     image     bytes of the model that lies in slot A when it starts; None: no model
     program   path of the firmware's ELF
-    The program cannot reach this computer but through its two serial lines: there is no semihosting.
+    The program cannot reach this computer but through its two serial lines: it has no semihosting and no
+    network. It ends by itself when nobody has talked to it for two minutes.
     Raises VirtualError when QEMU or the ELF is missing or QEMU does not start.
     """
 
@@ -133,7 +134,9 @@ class QemuBoard:
         time.sleep(seconds)
 
     def _gone(self):
-        said = self._errors.read_text(errors="replace").strip().splitlines() if self._errors.exists() else []
+        # QEMU warns of the network card that has no network.
+        text = self._errors.read_text(errors="replace") if self._errors.exists() else ""
+        said = [line for line in text.splitlines() if line.strip() and "warning:" not in line]
         reason = said[0] if said else "the program in it ended"
         return DisconnectedError(f"{self.port} is gone ({reason})",
                                  "apt-get install qemu-system-arm; make firmware")
@@ -141,8 +144,8 @@ class QemuBoard:
 
 def machine(qemu, program):
     """The command line of a board whose two serial lines are yet to be given; QEMU's path, the ELF's."""
-    return [qemu, "-M", "mps2-an386", "-display", "none", "-monitor", "none", "-no-reboot", "-icount",
-            f"shift={ICOUNT_SHIFT},align=off,sleep=on", "-kernel", program]
+    return [qemu, "-M", "mps2-an386", "-nodefaults", "-nic", "none", "-display", "none", "-monitor", "none",
+            "-no-reboot", "-icount", f"shift={ICOUNT_SHIFT},align=off,sleep=on", "-kernel", program]
 
 
 def section_counts(data):
