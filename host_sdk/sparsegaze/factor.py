@@ -43,9 +43,9 @@ def inverse(lower):
 def extremes(factor):
     """Largest and smallest eigenvalue of the matrix that was factored.
 
-    From the singular values of the factor, which lose half as many digits as eigenvalues of the matrix would; by
-    Lanczos iteration above DENSE_MOST rows, to 1e-3. Below 1 / CONDITION_MOST of the largest the smallest is
-    rounding, whatever computes it.
+    From the singular values of the factor, which lose half as many digits as eigenvalues of the matrix
+    would; by Lanczos iteration above DENSE_MOST rows, to 1e-3. Below 1 / CONDITION_MOST of the largest the
+    smallest is rounding, whatever computes it.
     """
     lower = factor[0]
     n = len(lower)
@@ -54,10 +54,8 @@ def extremes(factor):
         whole = LinearOperator((n, n), matvec=lambda v: lower @ (lower.T @ v))
         undone = LinearOperator((n, n), matvec=lambda v: cho_solve(factor, v, check_finite=False))
         try:
-            return tuple(
-                float(eigsh(m, 1, which="LA", v0=start, tol=1e-3, ncv=40, return_eigenvectors=False)[0]) ** sign
-                for m, sign in ((whole, 1), (undone, -1))
-            )
+            how = {"which": "LA", "v0": start, "tol": 1e-3, "ncv": 40, "return_eigenvectors": False}
+            return float(eigsh(whole, 1, **how)[0]), 1.0 / float(eigsh(undone, 1, **how)[0])
         except ArpackNoConvergence:
             pass
     singular = svdvals(lower, check_finite=False)
@@ -67,11 +65,13 @@ def extremes(factor):
 def leftover(cov, jitter, alpha, target, entries, lost):
     """Bound of what alpha [n, o] leaves of (K + jitter mean diagonal) alpha = target, K exact: [n, o].
 
-    The residual of the stored matrix, accumulated in extended precision where there is one, and what rounding of
-    its entries adds: eps (g |entry| + h), entries = (g, h); and `lost` per root-mean-square weight.
+    The residual of the stored matrix, accumulated in extended precision where there is one, and what
+    rounding of its entries adds: eps (g |entry| + h), entries = (g, h); and `lost` per root-mean-square
+    weight.
 
-    A mean k(x, X) alpha + h(x) b is off by w' r + m' t: r this, t what is left of H' alpha = 0, w the weights of
-    the data in the mean at x, m the multipliers of its columns. Exact, but for w and m, which are computed.
+    A mean k(x, X) alpha + h(x) b is off by w' r + m' t: r this, t what is left of H' alpha = 0, w the
+    weights of the data in the mean at x, m the multipliers of its columns. Exact, but for w and m, which
+    are computed.
     """
     weights, size = alpha.astype(np.longdouble), np.abs(alpha)
     extra = jitter * float(np.mean(np.diag(cov)))
@@ -84,6 +84,6 @@ def leftover(cov, jitter, alpha, target, entries, lost):
 
 
 def last_sum(cov, alpha, entries):
-    """Bound of the rounding of sum_i k(x, x_i) alpha_i itself, at places whose kernels are like the data's: [o]."""
+    """Bound of the rounding of sum_i k(x, x_i) alpha_i itself, where kernels are like the data's: [o]."""
     size = np.abs(alpha)
     return EPS * ((entries[0] + len(size)) * (np.abs(cov) @ size).max(axis=0) + entries[1] * size.sum(axis=0))

@@ -30,7 +30,7 @@ from .samples import Samples, spread
 LEARN_ROWS = 600  # rows of the likelihood that is searched from several starts
 ROWS_MAX = 3000  # of the process: 9e6 entries, 72 MB a matrix
 ROUNDING_MOST_DEG = 0.01  # proven error of a prediction by rounding; more jitter is added until it is below
-REPAIR_MISS_MOST = 1.7  # median of error over claim for samples left out; 0.83 is what a claim that is right has
+REPAIR_MISS_MOST = 1.7  # median of error over claim for samples left out; a claim that is right has 0.83
 PROBES = 200  # of the rows, and as many places between them, where the error by rounding is bounded
 _blas = ThreadpoolController()
 
@@ -41,10 +41,10 @@ class GaussianProcess:
 
     x [n, d], y [n, 2] the training data; hyper; mean "zero" | "constant" | "linear"; lml of both outputs
     kernel     kernels.Kernel;  alpha [n, 2] weights of s^2 k(., x_i);  beta [columns, 2] of the mean
-    condition  of the matrix that is solved (2-norm), jitter included; condition_raw without it, inf where it has no
-               Cholesky factor; above 4.5e14 float64 cannot tell it from any larger number (`describe`)
+    condition  of the matrix that is solved (2-norm), jitter included; condition_raw without it, inf where it
+               has no Cholesky factor. Above 4.5e14 float64 cannot tell it from any larger number
     jitter     relative to its mean diagonal;  dropped channels;  rows_given to fit (n of them kept)
-    rounding_deg  bound of a prediction's error by float64, inside the data, to first order in 2^-52
+    rounding_deg  bound of a prediction's error by float64, at the data and between them
     repair     None, or what was done to a matrix that is no covariance: words, smallest_eigenvalue and
                removed_share (of the sum of |eigenvalues|)
     """
@@ -98,8 +98,8 @@ class GaussianProcess:
 
         noise_scale   [n] relative noise variance of each sample (default 1)
         groups        int [n], samples that share one error; used when group_noise, or hyper.group_deg > 0
-        hyper         use these parameters instead of optimising the likelihood; with refine start from them, and
-                      take a few steps to its maximum (at most 14 evaluations on at most 2000 rows)
+        hyper         use these parameters instead of optimising the likelihood; with refine start from them
+                      and take a few steps to its maximum (at most 14 evaluations on at most 2000 rows)
         length_max    longest length scale, in standard deviations of the channel
         restarts      random starting points beside the standard one, drawn from the seed
         kernel, p, exponent  see kernels.kernel
@@ -107,8 +107,9 @@ class GaussianProcess:
         learn_rows    above it the likelihood is searched on that many rows, then polished on up to 2000
         rows_max      above it the process keeps that many rows, evenly spread, and warns
         The result is a pure function of data and seed; samples are put in a canonical order first.
-        Raises CalibrationError for fewer samples than the mean needs, for nan or infinities, when all channels
-        are constant, and when float64 cannot hold the answer. A constant channel is dropped with a warning.
+        Raises CalibrationError for fewer samples than the mean needs, for nan or infinities, when all
+        channels are constant, and when float64 cannot hold the answer. A constant channel is dropped with
+        a warning.
         """
         shape = make_kernel(kernel, p, exponent)
         known = Samples.check(features, gaze_deg, noise_scale, groups, shape, mean, rows_max, depth=3)
@@ -187,19 +188,19 @@ class GaussianProcess:
 
     @_blas.wrap(limits=1, user_api="blas")
     def likelihood_gap(self, restarts=8, seed=1):
-        """Log likelihood of the best of many tight searches, less that of the hyper-parameters in use: nats, >= 0.
+        """Log likelihood of the best of many tight searches, less that of `hyper`: nats, >= 0.
 
-        For a report, not for use: minutes at 2000 rows. The searches run on a part of the rows; the best three
-        and the parameters in use are then followed to convergence on up to 2000 of them.
+        For a report, not for use: minutes at 2000 rows. The searches run on a part of the rows; the best
+        three and the parameters in use are then followed to convergence on up to 2000 of them.
         """
         return gap(self, restarts, seed)
 
     def describe(self):
-        """The process in a dict that JSON can hold: kernel, hyper-parameters, fit, and what was done to the matrix."""
+        """The process in a dict for JSON: kernel, hyper-parameters, fit, what was done to the matrix."""
         error = self.y - self.loo()[0]
         named = self.kernel.name in ("minkowski", "laplace")
         certain = self.condition_raw <= CONDITION_MOST
-        beyond = f"without jitter beyond {CONDITION_MOST:.1e}, the most that float64 can tell: it may be any larger"
+        beyond = f"without jitter beyond {CONDITION_MOST:.1e}, all that float64 can tell: perhaps any larger"
         return {
             "kernel": self.kernel.name,
             "formula": f"{self.hyper.signal_deg:.6g}^2 {self.kernel.formula()}",
@@ -247,7 +248,7 @@ class GaussianProcess:
         return self.hyper.signal_deg**2 * value
 
     def _sound(self, k):
-        """Covariances [m, n] with the data, and variances, of the process that is solved; k from `_kernel`."""
+        """Covariances [m, n] with the data, and variances, of what is solved; k from `_kernel`."""
         s2 = self.hyper.signal_deg**2
         return (k, s2) if self._repair is None else self._repair.extend(k, s2)
 
@@ -296,7 +297,7 @@ class GaussianProcess:
             )
         if self.jitter and not self.noise_free:
             warnings.warn(
-                f"the covariance matrix is singular to float64: noise of {self._jitter_deg():.2g} deg was added",
+                f"the covariance matrix is singular to float64: noise of {self._jitter_deg():.2g} deg added",
                 stacklevel=5,
             )
         if verify and self.repair and self.repair["negative"]:
@@ -335,7 +336,8 @@ class GaussianProcess:
         relative, absolute = self.kernel.rounding(self._kept(self.x), self.hyper.lengths(self.kernel))
         entries = relative, absolute * s2
         lost = 30 * EPS * self._repair.values[-1] if self._repair else 0.0
-        miss = leftover(cov, self.jitter, alpha, self.y - h @ self.beta, entries, lost) + 4 * EPS * np.abs(self.y)
+        miss = leftover(cov, self.jitter, alpha, self.y - h @ self.beta, entries, lost)
+        miss += 4 * EPS * np.abs(self.y)
         v = solve_triangular(self._factor[0], self._sound(self._kernel(probes))[0].T, lower=True)
         off = np.zeros((len(probes), 2))
         if h.shape[1]:
@@ -350,9 +352,10 @@ class GaussianProcess:
         """cov made a covariance matrix."""
         self._repair = fix = Repair(cov)
         done = f"{fix.negative} negative eigenvalues, {100 * fix.share:.2g} % of the spectrum, were removed"
+        done = done if fix.negative else "on these samples it happens to, nothing had to be removed"
+        distance = f"the Minkowski distance of p = {self.kernel.p:g}"
         self.repair = {
-            "words": f"the Minkowski distance of p = {self.kernel.p:g} gives no covariance in 3 or more channels: "
-            + (done if fix.negative else "on these samples it happens to, nothing had to be removed"),
+            "words": f"{distance} gives no covariance in 3 or more channels: {done}",
             "negative": fix.negative,
             "smallest_eigenvalue": fix.least / self.hyper.signal_deg**2,
             "removed_share": fix.share,
@@ -363,8 +366,8 @@ class GaussianProcess:
     def _verify_repair(self):
         """Refuse a repair whose process misses what it has not seen by more than it says.
 
-        Leaving out in closed form cannot tell: the repaired matrix has seen the sample. So every eighth sample is
-        left out of matrix and repair.
+        Leaving out in closed form cannot tell: the repaired matrix has seen the sample. So every eighth
+        sample is left out of matrix and repair.
         """
         out = np.arange(len(self.x)) % 8 == 3
         known = [v[~out] for v in (self.x, self.y, self.noise_scale, self.groups)]
@@ -378,8 +381,8 @@ class GaussianProcess:
         self.repair |= {"held_out_deg": float(np.median(miss)), "claimed_deg": float(np.median(said))}
         if np.median(miss / said) > REPAIR_MISS_MOST:
             raise CalibrationError(
-                f"p = {self.kernel.p:g} cannot be repaired with these hyper-parameters: samples left out are missed by "
-                f"{np.median(miss):.2g} deg where the process claims {np.median(said):.2g}",
+                f"p = {self.kernel.p:g} cannot be repaired with these hyper-parameters: samples left out are "
+                f"missed by {np.median(miss):.2g} deg where the process claims {np.median(said):.2g}",
                 "use p of at most 2, or have the hyper-parameters learnt",
             )
         warnings.warn(self.repair["words"], stacklevel=5)

@@ -13,8 +13,9 @@ from .likelihood import Likelihood, learn, polish, thorough
 class Hyper:
     """Kernel parameters in the units of the data.
 
-    length [d] in the kernel's length unit: feature units, but for canberra (a pure number) and cosine (rad, the
-    same in all channels); inf drops a channel. signal_deg, noise_deg, group_deg standard deviations
+    length [d] in the kernel's length unit: feature units, but for canberra (a pure number) and cosine
+    (rad, the same in all channels); inf drops a channel
+    signal_deg, noise_deg, group_deg  standard deviations
     """
 
     length: np.ndarray
@@ -28,16 +29,16 @@ class Hyper:
         return np.isfinite(self.length)
 
     def checked(self, channels, dropped):
-        """This for data of so many channels, the dropped ones left out. Raises CalibrationError if it cannot be."""
+        """This less the dropped channels. Raises CalibrationError if it does not fit so many channels."""
         length = np.array(self.length, float)
         deviations = self.signal_deg, self.noise_deg, self.group_deg
         if length.shape != (channels,):
-            raise CalibrationError(f"{length.size} length scales for {channels} channels", "give one for each")
+            raise CalibrationError(f"{length.size} length scales for {channels} channels", "give one each")
         length[list(dropped)] = np.inf
         if not (np.all(length > 0) and np.isfinite(length).any()):
-            raise CalibrationError("length scales must be above 0, and one of a live channel finite", "learn them")
+            raise CalibrationError("length scales must be above 0, a live one finite", "learn them")
         if not (np.isfinite(deviations).all() and self.signal_deg > 0 and min(deviations) >= 0):
-            raise CalibrationError("signal_deg must be above 0, noise_deg and group_deg not below", "learn them")
+            raise CalibrationError("signal_deg must be above 0, noise_deg, group_deg not below", "learn it")
         return replace(self, length=length)
 
     def lengths(self, kernel):
@@ -52,7 +53,7 @@ def learnt(gp, restarts, seed, group_noise, rows):
 
 
 def refined(gp, rows):
-    """gp.hyper after a few steps towards the maximum of its likelihood; `rows` for the curvature it starts with."""
+    """gp.hyper after a few steps towards the maximum of its likelihood; `rows` see likelihood.polish."""
     grouped = gp.hyper.group_deg > 0
     problem, level, unit = _problem(gp, grouped)
     theta = polish(problem, _theta(gp, level, unit), gp.length_max, rows)
@@ -81,7 +82,9 @@ def _hyper(gp, theta, level, unit, group_noise):
 
 def _live(gp):
     """Channels that the kernel sees."""
-    return [j for j in range(gp.x.shape[1]) if (j not in gp.dropped if gp.hyper is None else gp.hyper.used[j])]
+    if gp.hyper is not None:
+        return list(np.flatnonzero(gp.hyper.used))
+    return [j for j in range(gp.x.shape[1]) if j not in gp.dropped]
 
 
 def _problem(gp, group_noise):

@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariance functions of the distance measures that LED2Gaze section 5.2 compares, each in a form that is one.
+"""Covariance functions of the distance measures that LED2Gaze section 5.2 compares, each in a PD form.
 
-    name            k(x, x') / s^2                                     positive definite, because
+    name            k(x, x') / s^2                                      positive definite (PD), because
     rbf             exp(-r^2 / 2),  r^2 = sum_j ((x_j - x'_j) / l_j)^2   Schoenberg 1938
     matern52        (1 + a + a^2 / 3) exp(-a),  a = sqrt(5) r           R & W equation 4.17
     laplace         exp(-sum_j |x_j - x'_j| / l_j)                      minkowski with p = 1
     minkowski p<=2  exp(-D^q),  D^p = sum_j (|x_j - x'_j| / l_j)^p      Schoenberg, for 0 < q <= p; q = p here
-    minkowski p>2   exp(-D^q),  q = 1                                   NOT in 3 or more channels, for any q > 0
-                                                                        (Misiewicz 1989, Koldobsky 1991); in 2
-                                                                        channels it is, in 1 it is laplace
-    canberra        exp(-sum_j |x_j - x'_j| / (x_j + x'_j) / l_j)       Polya: |x-x'|/(x+x') = tanh(|log x/x'| / 2)
+    minkowski p>2   exp(-D^q),  q = 1                                   NOT in 3 or more channels, at any q
+                                                                        (Misiewicz 1989, Koldobsky 1991)
+    canberra        exp(-sum_j |x_j - x'_j| / (x_j + x'_j) / l_j)       Polya: |x-x'|/(x+x') is
+                                                                        tanh(|log x - log x'| / 2)
     cosine          exp((cos(x, x') - 1) / l^2)                         exp of an inner product
 
-With p < 1 the measure is no metric (a detour is shorter), but the kernel needs none: it is a product of PD kernels.
-A measure that has a PD form is given that form and refused in others (exp(-D^2 / 2 l^2) on L1, L1.5 or Canberra
-misses by up to 18 deg, silently). p > 2 has none: gp.py repairs its matrix and says so.
+With p > 2 it is PD in 2 channels, and in 1, where it is laplace. With p < 1 the measure is no metric (a
+detour is shorter), but the kernel needs none: it is a product of covariances of one channel each.
+A measure that has a PD form is given that form and refused in others (exp(-D^2 / 2 l^2) on L1, L1.5 or
+Canberra misses by up to 18 deg, silently). p > 2 has none: gp.py repairs its matrix and says so.
 """
 
 import numpy as np
@@ -36,7 +37,7 @@ def kernel(name="rbf", p=None, exponent=None):
     if name == "minkowski":
         if p is None or not float(p) > 0:
             raise CalibrationError(
-                "the Minkowski kernel needs its order p, a number above 0" + ("" if p is None else f", not {p}"),
+                "the Minkowski kernel needs its order p, above 0" + ("" if p is None else f", not {p}"),
                 "give p, for example 1.5",
             )
     elif p is not None:
@@ -303,6 +304,8 @@ class Steep(Kernel):
 
     def formula(self):
         power = "" if self.exponent == 1 else f"^{self.exponent:g}"
+        if np.isinf(self.p):
+            return f"exp(-D{power}), D = max_j |x_j-y_j|/l_j"
         return f"exp(-D{power}), D = (sum_j (|x_j-y_j|/l_j)^{self.p:g})^(1/{self.p:g})"
 
 
@@ -338,8 +341,8 @@ class Canberra(Kernel):
         return np.sign(a[:, None] - b) * 2.0 * b / np.where(total > 0, total, 1.0) ** 2
 
     def formula(self):
-        power = "" if self.exponent == 1 else f"^{self.exponent:g}"
-        return f"exp(-(sum_j |x_j-y_j|/(x_j+y_j)/l_j){power})" if power else "exp(-sum_j |x_j-y_j|/(x_j+y_j)/l_j)"
+        total = "sum_j |x_j-y_j|/(x_j+y_j)/l_j"
+        return f"exp(-{total})" if self.exponent == 1 else f"exp(-({total})^{self.exponent:g})"
 
 
 class Cosine(Kernel):

@@ -36,7 +36,8 @@ class Likelihood:
     """
 
     def __init__(self, kernel, z, unit, y, h, noise_scale, groups, noise_free=False, group_noise=False):
-        self.kernel, self.z, self.y, self.h, self.noise_scale, self.groups = kernel, z, y, h, noise_scale, groups
+        self.kernel, self.z, self.y, self.h = kernel, z, y, h
+        self.noise_scale, self.groups = noise_scale, groups
         self.unit, self.noise_free, self.group_noise = np.asarray(unit, float), noise_free, group_noise
         self.sound = kernel.definite(z.shape[1])
         self._stack = None
@@ -60,7 +61,7 @@ class Likelihood:
 
     def bounds(self, length_max=LENGTH_RANGE[1]):
         """[len(theta), 2]"""
-        scales = [SIGNAL_RANGE] + [NOISE_RANGE] * (not self.noise_free) + [NOISE_RANGE] * bool(self.group_noise)
+        scales = [SIGNAL_RANGE] + [NOISE_RANGE] * ((not self.noise_free) + bool(self.group_noise))
         return np.log([(LENGTH_RANGE[0], length_max)] * len(self.unit) + scales)
 
     def start(self, length_max=LENGTH_RANGE[1]):
@@ -149,7 +150,7 @@ def random_starts(problem, count, seed, length_max):
 
 
 def learn(problem, length_max, restarts, seed, rows):
-    """theta near the maximum: searched from several starts on at most `rows` rows, then polished on REFINE_ROWS."""
+    """theta near the maximum: searched from several starts on at most `rows` rows, then `polish`ed."""
     n = len(problem.z)
     part = problem.part(spread(n, rows if problem.sound else min(rows, LEARN_ROWS_REPAIRED)))
     theta, _ = maximise(part, random_starts(part, restarts, seed, length_max), length_max)
@@ -157,7 +158,7 @@ def learn(problem, length_max, restarts, seed, rows):
 
 
 def polish(problem, theta, length_max, rows):
-    """theta nearer to the maximum on REFINE_ROWS, the curvature taken from `rows` of them. A repair is left alone."""
+    """theta nearer to the maximum on REFINE_ROWS, curvature from `rows` of them; a repair is left alone."""
     if not problem.sound:
         return theta
     n = len(problem.z)
@@ -173,17 +174,17 @@ def thorough(problem, theta, length_max, restarts, seed):
     whole = problem.part(spread(len(problem.z), REFINE_ROWS))
     part = whole.part(spread(len(whole.z), STACK_MOST))
     starts = [theta] + random_starts(part, restarts, seed, length_max)
-    ends = sorted((maximise(part, [start], length_max, tight=True) for start in starts), key=lambda end: -end[1])
-    ends = [theta] + [end for end, _ in ends[:3]]
+    ends = [maximise(part, [start], length_max, tight=True) for start in starts]
+    ends = [theta] + [end for end, _ in sorted(ends, key=lambda end: -end[1])[:3]]
     best = max(maximise(whole, [end], length_max, tight=True)[1] for end in ends)
     return float(max(0.0, best - whole(theta)[0]))
 
 
 def refine(problem, part, theta, length_max, evaluations):
-    """A few quasi-Newton steps on `problem` from the maximum theta of its `part`: (theta, value, evaluations).
+    """A few quasi-Newton steps on `problem` from the maximum of its `part`: (theta, value, evaluations).
 
-    The curvature of the part, scaled by the number of rows, is the first guess of the whole's, so that the first
-    step is nearly Newton's; BFGS updates it. Never returns less likelihood than it was given.
+    The curvature of the part, scaled by the number of rows, is the first guess of the whole's, so that the
+    first step is nearly Newton's; BFGS updates it. Never returns less likelihood than it was given.
     """
     bounds = problem.bounds(length_max)
     theta = np.clip(theta, *bounds.T)

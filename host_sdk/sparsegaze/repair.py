@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A symmetric matrix of similarities that is no covariance, made into the nearest one that is.
 
-Negative eigenvalues are set to 0 (Higham 1988: the nearest positive semidefinite matrix). Weights of the matrix as
-it is would be meaningless, and adding the missing eigenvalue as noise leaves one direction that is almost singular:
-on simulated recordings and p = 10 that missed by 700 deg where this misses by 1.
+Negative eigenvalues are set to 0 (Higham 1988: the nearest positive semidefinite matrix). Weights of the
+matrix as it is would be meaningless, and adding the missing eigenvalue as noise leaves one direction that
+is almost singular: on simulated recordings and p = 10 that missed by 700 deg where this misses by 1.
 """
 
 import numpy as np
@@ -13,8 +13,8 @@ RANK_TOLERANCE = 1e-12  # of the largest eigenvalue: smaller ones are removed as
 
 
 class Repair:
-    """matrix [n, n] repaired;  values [r], vectors [n, r] of its range;  least, negative: smallest eigenvalue and
-    number of negative ones before;  share: of the sum of |eigenvalues| that was removed
+    """matrix [n, n] repaired;  values [r], vectors [n, r] of its range;  least, negative: smallest
+    eigenvalue and number of negative ones before;  share: of the sum of |eigenvalues| that was removed
     """
 
     def __init__(self, matrix):
@@ -45,9 +45,10 @@ class Repair:
     def extend(self, k, variance):
         """Covariances [m, n] and variances [m] at new places, from similarities k [m, n] with the data.
 
-        The process whose covariance is k(x, X) K+^-1 k(X, x'), K+ the repaired matrix on its range (Nystroem's
-        extension), plus what of `variance` that leaves out, as noise of its own at each place. It is positive
-        definite everywhere and equals K+ on the data, so that no predicted variance is negative.
+        The process whose covariance is k(x, X) K+^-1 k(X, x'), K+ the repaired matrix on its range
+        (Nystroem's extension), plus what of `variance` that leaves out, as noise of its own at each place.
+        It is positive definite everywhere and equals K+ on the data, so that no predicted variance is
+        negative.
         """
         along = k @ self.vectors
         return along @ self.vectors.T, np.maximum(variance, np.sum(along * along / self.values, axis=1))

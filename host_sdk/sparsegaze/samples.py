@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training data of a Gaussian process, checked, in canonical order, and thinned to what a process may keep."""
+"""The training data of a Gaussian process: checked, in canonical order, thinned to what it may keep."""
 
 import warnings
 from dataclasses import dataclass

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels written out, a Gaussian process in 60 decimal digits, and the simulated data that gp.py is judged on.
+"""Kernels written out, a Gaussian process in 60 decimal digits, and the simulated data gp.py is judged on.
 
 Gaussian elimination from the definitions of the kernels; it shares no line with the product.
 """

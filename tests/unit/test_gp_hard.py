@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The hard cases of a calibration's mathematics, each with what the process must do; references in 60 digits."""
+"""The hard cases of a calibration's mathematics, each with what the process must do; judged in 60 digits."""
 
 import os
 import subprocess
@@ -24,13 +24,14 @@ def test_length_scales_from_1e_3_to_1e3_agree_with_60_digits_within_the_stated_b
 ):
     features, gaze = recording(18)
     query = np.vstack([recording(4, seed=5)[0], features[:2]])
-    gp = quietly(features, gaze, mean=mean, hyper=hyper_for(name, scale, signal_deg, noise_deg), kernel=name, p=p)
+    hyper = hyper_for(name, scale, signal_deg, noise_deg)
+    gp = quietly(features, gaze, mean=mean, hyper=hyper, kernel=name, p=p)
     error = np.abs(gp.predict(query) - reference(gp, query, p)).max()
     assert error <= gp.rounding_deg <= 0.01
 
 
 def test_the_bound_is_not_idle():
-    """Rounded to single precision the weights break the bound: it can tell a wrong answer from a right one."""
+    """Rounded to single precision the weights break the bound: it tells a wrong answer from a right one."""
     features, gaze = recording(18)
     gp = quietly(features, gaze, mean="zero", hyper=Hyper(LENGTH * 3, 30.0, 0.01))
     wrong = gp._kernel(features) @ gp.alpha.astype(np.float32)
@@ -71,16 +72,17 @@ def test_exact_duplicates_without_noise_take_a_jitter_that_is_reported(name, p):
 
 
 def test_the_condition_number_is_right_up_to_where_float64_can_tell_and_named_beyond():
-    """Two samples at a distance have K = s^2 [[1, c], [c, 1]], condition (1 + c) / (1 - c), known in closed form.
+    """Two samples at a distance have K = s^2 [[1, c], [c, 1]], condition (1 + c) / (1 - c).
 
     Figures are right to 1e-14 of themselves squared: 4 % at 4e12. A third sample is far away.
     """
-    for gap, expected_known in ((1.0, True), (1e-3, True), (1e-6, True), (3e-7, True), (1e-8, False), (0.0, False)):
+    for gap, known in ((1.0, True), (1e-3, True), (1e-6, True), (3e-7, True), (1e-8, False), (0.0, False)):
         x = np.array([[0.0], [gap], [9.0]])
-        gp = quietly(x, np.zeros((3, 2)) + [[1.0], [1.0], [-1.0]], mean="zero", hyper=Hyper(np.ones(1), 1.0, 0.0))
+        y = np.array([[1.0, 1.0], [1.0, 1.0], [-1.0, -1.0]])
+        gp = quietly(x, y, mean="zero", hyper=Hyper(np.ones(1), 1.0, 0.0))
         c = np.exp(-0.5 * gap**2)
         told = gp.describe()
-        if expected_known:
+        if known:
             expected = (1 + c) / -np.expm1(-0.5 * gap**2)
             assert gp.condition_raw == pytest.approx(expected, rel=max(1e-9, 1e-14 * expected))
             assert told["condition_raw"] == gp.condition_raw and told["condition_note"] == ""
@@ -132,17 +134,18 @@ def test_a_constant_channel_is_dropped_with_a_warning_whatever_the_kernel(name, 
     features[:, 4] = dead
     with pytest.warns(UserWarning, match="constant channel dropped: s4"):
         gp = GaussianProcess.fit(features, gaze, mean="constant", kernel=name, p=p, restarts=0)
-    without = GaussianProcess.fit(np.delete(features, 4, 1), gaze, mean="constant", kernel=name, p=p, restarts=0)
+    rest = np.delete(features, 4, 1)
+    without = GaussianProcess.fit(rest, gaze, mean="constant", kernel=name, p=p, restarts=0)
     changed = features.copy()
     changed[:, 4] = 1234.0
-    np.testing.assert_allclose(gp.predict(changed), without.predict(np.delete(features, 4, 1)), atol=1e-6)
+    np.testing.assert_allclose(gp.predict(changed), without.predict(rest), atol=1e-6)
     assert gp.describe()["length"][4] is None and np.all(gp.gradient(features)[:, :, 4] == 0)
 
 
 @every_kernel
 @pytest.mark.parametrize("stuck", [65535.0, 0.0])
 def test_a_led_that_saturates_or_dies_on_half_of_the_rows(name, p, stuck):
-    """The other five channels carry the gaze: held-out error stays below a degree and a half, on both halves."""
+    """The other five channels carry the gaze: held-out error on both halves stays small."""
     features, gaze = recording(160)
     features[:80, 2] = stuck
     held = np.r_[70:80, 150:160]
@@ -185,7 +188,8 @@ def test_one_outlier_of_100_sigma_is_the_worst_left_out_and_its_removal_heals(na
     worst = int(np.argmax(miss))
     np.testing.assert_array_equal(gp.y[worst], bad[7])
     assert miss[worst] > 25
-    healed = quietly(np.delete(features, 7, 0), np.delete(bad, 7, 0), mean="constant", kernel=name, p=p, hyper=gp.hyper)
+    rest = np.delete(features, 7, 0), np.delete(bad, 7, 0)
+    healed = quietly(*rest, mean="constant", kernel=name, p=p, hyper=gp.hyper)
     assert np.abs(healed.predict(features) - clean.predict(features)).max() < 5 * sigma
 
 
@@ -262,7 +266,8 @@ def test_nan_infinities_and_absurd_sizes_are_refused_in_words(name, p, bad):
 
 def test_queries_of_another_width_or_outside_the_measure_are_refused():
     features, gaze = recording(30)
-    gp = quietly(features, gaze, mean="constant", kernel="canberra", hyper=hyper_for("canberra", 1.0, 30.0, 0.3))
+    hyper = hyper_for("canberra", 1.0, 30.0, 0.3)
+    gp = quietly(features, gaze, mean="constant", kernel="canberra", hyper=hyper)
     with pytest.raises(CalibrationError, match="6 channels"):
         gp.predict(features[:, :5])
     with pytest.raises(CalibrationError, match="below 0"):
@@ -288,6 +293,6 @@ def test_order_and_threads_do_not_change_a_bit_whatever_the_kernel(tmp_path):
     answers = []
     for seed, threads in (("1", "1"), ("2", "4")):
         env = dict(os.environ, OMP_NUM_THREADS=threads, OPENBLAS_NUM_THREADS=threads)
-        done = subprocess.run([sys.executable, "-c", script, seed], env=env, capture_output=True, text=True, check=True)
-        answers.append(done.stdout)
+        command = [sys.executable, "-c", script, seed]
+        answers.append(subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout)
     assert answers[0] == answers[1] and len(answers[0]) > 10_000

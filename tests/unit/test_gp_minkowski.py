@@ -40,7 +40,7 @@ def indefinite(n=200):
 @pytest.mark.parametrize("p", [3.0, 10.0, np.inf])
 def test_p_above_2_is_repaired_in_words_and_predicts_consistently(p):
     features, gaze, hyper = indefinite()
-    with pytest.warns(UserWarning, match="gives no covariance in 3 or more channels.*eigenvalues.*were removed"):
+    with pytest.warns(UserWarning, match="gives no covariance in 3 or more channels.*values.*were removed"):
         gp = GaussianProcess.fit(features, gaze, mean="constant", kernel="minkowski", p=p, hyper=hyper)
     assert gp.repair["smallest_eigenvalue"] < -1e-3 and 0 < gp.repair["removed_share"] < 0.5
     assert gp.repair["negative"] > 0 and gp.repair["rank"] + gp.repair["negative"] <= 200
@@ -65,7 +65,7 @@ def test_p_above_2_is_repaired_in_words_and_predicts_consistently(p):
 
 
 def test_a_repair_that_misses_by_more_than_it_claims_is_refused():
-    """A long length scale and hardly any noise: what was removed mattered, samples left out are 30 deg off."""
+    """A long length scale and hardly any noise: what was removed mattered: 30 deg for samples left out."""
     features, gaze, _ = indefinite()
     hyper = Hyper(np.full(6, 3e4), 60.0, 0.03)
     with pytest.raises(CalibrationError, match="p = 10 cannot be repaired.*use p of at most 2"):
