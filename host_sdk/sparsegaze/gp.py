@@ -298,7 +298,7 @@ class GaussianProcess:
         if self.jitter and not self.noise_free:
             warnings.warn(
                 f"the covariance matrix is singular to float64: noise of {self._jitter_deg():.2g} deg added",
-                stacklevel=5,
+                stacklevel=4,
             )
         if verify and self.repair and self.repair["negative"]:
             self._verify_repair()

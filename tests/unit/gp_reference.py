@@ -121,7 +121,7 @@ def decimal_solve(matrix, right):
 
 
 def reference(gp, query, p=None):
-    """The mean [m, 2] of gp at query in 60 digits, mean zero or constant, the jitter it reports included."""
+    """The mean [m, 2] of gp at query in 60 digits, the jitter it reports included."""
     length = exactly(gp.hyper.length)
     s2, noise2 = Decimal(float(gp.hyper.signal_deg)) ** 2, Decimal(float(gp.hyper.noise_deg)) ** 2
     x = [exactly(row) for row in gp.x]
@@ -131,12 +131,15 @@ def reference(gp, query, p=None):
     extra = Decimal(gp.jitter) * sum(k[i][i] for i in range(len(x))) / len(x)
     for i in range(len(x)):
         k[i][i] += extra
-    right, one = [exactly(row) for row in gp.y], [Decimal(1)] if gp.mean == "constant" else []
-    if one:
-        k = [row + one for row in k] + [one * len(x) + [Decimal(0)]]
-        right.append([Decimal(0)] * 2)
-    weights = decimal_solve(k, right)
-    rows = [[s2 * decimal_kernel(gp.kernel.name, p, exactly(q), b, length) for b in x] + one for q in query]
+    columns = {"zero": 0, "constant": 1, "linear": 7}[gp.mean]
+    basis = [([Decimal(1)] + row)[:columns] for row in x]
+    zeros = [Decimal(0)] * columns
+    k = [row + h for row, h in zip(k, basis)] + [[h[c] for h in basis] + zeros for c in range(columns)]
+    weights = decimal_solve(k, [exactly(row) for row in gp.y] + [[Decimal(0)] * 2] * columns)
+    rows = [
+        [s2 * decimal_kernel(gp.kernel.name, p, q, b, length) for b in x] + ([Decimal(1)] + q)[:columns]
+        for q in map(exactly, query)
+    ]
     return np.array([[float(sum(u * w[o] for u, w in zip(row, weights))) for o in (0, 1)] for row in rows])
 
 
