@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The peers' bench: float C on a simulated ATmega328P answers what numpy answers, and what does not fit is told
-apart. The libraries themselves are not needed here."""
+"""The peers' bench: float C on a simulated ATmega328P answers what numpy answers, what does not fit is told
+apart, settings are chosen on the calibration alone. The libraries themselves are not needed here."""
 
 import sys
 from pathlib import Path
@@ -12,7 +12,7 @@ BENCH = Path(__file__).resolve().parents[2] / "tools" / "bench"
 sys.path.insert(0, str(BENCH))
 try:
     import inference_peers
-    from peers import avr_program, candidate, float_gp, polynomial
+    from peers import avr_program, candidate, float_gp, polynomial, training
 finally:
     sys.path.remove(str(BENCH))
 
@@ -219,3 +219,73 @@ def test_without_the_peers_environment_the_table_says_so(data, workdir, monkeypa
     monkeypatch.setattr(inference_peers, "PYTHON", workdir / "none")
     rows = inference_peers.measure("set", data[:2], data[2:], data[3], data[3], workdir / "absent")
     assert [r["fits"] for r in rows] == [False] and "setup_bench.sh" in rows[0]["note"]
+
+
+@pytest.fixture(scope="module")
+def calibration(data):
+    """60 targets of 10 frames each, and 300 more rows between them."""
+    rng = np.random.default_rng(5)
+    target = np.repeat(data[3], 10, axis=0)
+    frames = np.repeat(data[2], 10, axis=0) + rng.normal(0, 2, (600, 6))
+    spread = frames[::2] + 1, target[::2] + rng.uniform(-0.1, 0.1, (300, 2))
+    return training.Calibration(frames, target, spread)
+
+
+def test_frames_of_a_target_that_is_left_out_train_nobody(calibration):
+    seen = []
+
+    def make(x, y):
+        seen.append((x, y))
+        return lambda q: np.zeros((len(q), 2))
+
+    assert set(calibration.sets) == {"frames", "means", "spread"}
+    for name in calibration.sets:
+        seen.clear()
+        calibration.error(make, name)
+        assert len(seen) == training.FOLDS
+        for fold, (_, y) in enumerate(seen):
+            left_out = calibration.target_deg[calibration.fold_of_group[calibration.group] == fold]
+            apart = np.linalg.norm(y[:, None] - np.unique(left_out, axis=0), axis=2)
+            assert apart.min() > 0.15, "a row as near as augmentation moves it"
+            assert len(y) >= len(calibration.sets[name][0]) // 2
+
+
+def test_the_error_is_that_of_single_frames_of_targets_left_out(calibration):
+    perfect = calibration.error(lambda x, y: lambda q: calibration.target_deg[_rows(calibration, q)], "means")
+    assert perfect == 0.0
+    nothing = calibration.error(lambda x, y: lambda q: np.zeros((len(q), 2)), "means")
+    assert nothing == pytest.approx(np.hypot(*calibration.target_deg.T).mean())
+
+
+def _rows(calibration, features):
+    return [int(np.flatnonzero((calibration.features == f).all(axis=1))[0]) for f in features]
+
+
+def test_the_choice_with_the_least_error_is_taken(calibration):
+    def make(x, y, shift):
+        return lambda q: calibration.target_deg[_rows(calibration, q)] + shift - (len(x) < 100) / 4
+
+    name, (shift,) = calibration.best(make, [(3.0,), (0.25,), (-1.0,)])
+    assert (name, shift) == ("means", 0.25)
+
+
+def test_a_calibration_of_single_samples_has_no_means(data):
+    assert set(training.Calibration(data[0], data[1]).sets) == {"frames"}
+
+
+def test_thinning_takes_as_many_rows_of_each_group():
+    group = np.repeat([0, 1, 2], [500, 30, 3])
+    kept = training.evenly(group, 63, np.random.default_rng(0))
+    assert np.bincount(group[kept]).tolist() == [30, 30, 3]
+    assert len(np.unique(kept)) == 63 and (np.diff(kept) > 0).all()
+
+
+def test_scikit_learns_likelihood_is_told_in_degrees(data):
+    """A Gaussian of the targets themselves, whatever unit scikit-learn was given."""
+    c = training.Calibration(data[0][::3], data[1][::3])
+    gp = training.SklearnGP.learn(c, "frames")
+    x, y = c.features / gp.length, c.target_deg - c.middle_deg
+    cov = gp.signal_deg**2 * float_gp.kernel(x, x) + gp.noise_deg**2 * np.eye(len(x))
+    _, logdet = np.linalg.slogdet(cov)
+    exact = -0.5 * np.sum(y * np.linalg.solve(cov, y)) - logdet - len(x) * np.log(2 * np.pi)
+    assert gp.rows == len(x) and gp.lml == pytest.approx(exact, rel=1e-4)

@@ -25,7 +25,7 @@ EQUAL_ERROR = 1.05  # of the full process's error to the truth: the project's ow
 DEGREES = (2, 3, 4)
 RIDGES = (1e-10, 1e-8, 1e-6, 1e-4, 1e-2)
 UNUSED = (
-    ("everywhereml", "0.2.40", "forests and trees as classifiers only, no regression; brings 30 packages"),
+    ("everywhereml", "0.2.40", "classifiers (trees, forests, XGBoost), no regression; 40 packages"),
     ("sklearn-porter", "0.7.4", "import fails with scikit-learn 1.9.1: No module named 'sklearn.tree.tree'"),
 )
 
