@@ -51,6 +51,7 @@ def examine():
         avr_toolchain(),
         bootloaders(),
         virtual_nano(),
+        cortex_m4(),
         simulator(),
         avrdude(),
         extra("pygame-ce", "pygame", "screen", "the calibration screen on a real device"),
@@ -180,6 +181,19 @@ def virtual_nano():
     if code in (None, 126, 127):
         return Check(name, None, _line(text) or f"{program} does not start", "make setup native")
     return Check(name, True, str(program))
+
+
+def cortex_m4():
+    """QEMU and the firmware that runs in it."""
+    program, image = shutil.which("qemu-system-arm"), SOURCE_TREE / "build" / "firmware" / "cortex-m4.elf"
+    if program and image.is_file():
+        return Check("Cortex-M4", True, f"{image} in {program}")
+    return Check(
+        "Cortex-M4",
+        None,
+        f"no {image}" if program else "no qemu-system-arm",
+        "apt-get install qemu-system-arm gcc-arm-none-eabi; make firmware; needed for predict --on cortex-m4",
+    )
 
 
 def simulator():

@@ -205,6 +205,19 @@ def test_a_record_with_a_part_missing_is_refused(tmp_path):
             board.sections()
 
 
+@pytest.mark.parametrize("target,kind", [("host", None), ("nano", "cycles (exact)"),
+                                         ("cortex-m4", "instructions")])
+def test_the_command_says_the_same_of_every_target(files, target, kind, capsys):
+    model, path, recording = files
+    assert run(["predict", model, path, "--on", target, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    here = predict(random_model(16), recording.features[recording.valid]).report()
+    assert (said["target"], said["cycle_kind"]) == (target, kind)
+    assert all(said[key] == here[key] for key in ("n", "model_crc", "output_crc", "azimuth_deg", "elevation_deg",
+                                                  "flags", "sigma_deg"))
+    assert (said["cycles_min"] is None) == (target == "host") == (said["cycles_max"] is None)
+
+
 @pytest.fixture
 def files(tmp_path):
     """A model and a recording of 40 rows, 30 of them valid: (model path, recording path, Recording)."""
