@@ -457,6 +457,219 @@ sg_gp_trend:
     ret
     .size sg_gp_trend, . - sg_gp_trend
 
+; uint8_t sg_gp_round(const struct sg_gp_sum *sum r25:r24, uint8_t weight_frac_bits r22, int16_t deg_q7[2] r21:r20)
+#undef zero
+#undef mask
+#undef out
+#define bits r22
+#define shifts r23
+#define mask r24
+#define out r25
+.macro rounded at
+    ldd r18, Z+\at
+    ldd r19, Z+\at+1
+    ldd r20, Z+\at+2
+    mov r21, r20                ; sign
+    lsl r21
+    sbc r21, r21
+    mov shifts, bits
+1:
+    cpi shifts, 9               ; Q.(bits + 8) to Q.17
+    brsh 2f
+    lsl r18
+    rol r19
+    rol r20
+    rol r21
+    inc shifts
+    rjmp 1b
+2:
+    subi r19, -2                ; (r21:r20:r19 + 2) >> 2
+    sbci r20, -1
+    sbci r21, -1
+    asr r21
+    ror r20
+    ror r19
+    asr r21
+    ror r20
+    ror r19
+    mov mask, r20               ; does the sign of 16 bits tell all of it?
+    lsl mask
+    sbc mask, mask
+    eor mask, r21
+    neg mask
+    sbc mask, mask              ; all ones if not
+    or out, mask
+    lsl r21                     ; then 0x7FFF, or 0x8000 when negative
+    sbc r21, r21
+    com r21
+    ldi r18, 0x80
+    eor r18, r21
+    eor r21, r19
+    and r21, mask
+    eor r19, r21
+    eor r18, r20
+    and r18, mask
+    eor r20, r18
+    st X+, r19
+    st X+, r20
+.endm
+
+    .section .text.sg_gp_round, "ax", @progbits
+    .global sg_gp_round
+    .type sg_gp_round, @function
+sg_gp_round:
+    movw r26, r20
+    movw r30, r24
+    clr out
+    rounded 0
+    rounded 4
+    mov r24, out
+    andi r24, 4                 ; SG_GP_OUT_OF_RANGE
+    ret
+    .size sg_gp_round, . - sg_gp_round
+#undef out
+
+; void sg_gp_find(const int16_t deg_q7[2] r25:r24, const uint8_t *origin r23:r22, uint8_t space r20,
+;                 struct sg_gp_place *place r19:r18)
+; X walks the angles, Z the grid's description, Y is the place.
+#define from0 r4                /* origins: azimuth, elevation */
+#define from1 r5
+#define from2 r6
+#define from3 r7
+#define scale0 r8
+#define scale1 r9
+#define wide r10
+#define tall r11
+#define grid0 r12
+#define grid1 r13
+.macro description load
+    \load from0, Z+
+    \load from1, Z+
+    \load from2, Z+
+    \load from3, Z+
+    adiw r30, 2
+    \load scale0, Z+
+    \load scale1, Z+
+    \load wide, Z+
+    \load tall, Z+
+.endm
+
+; cell and fraction of one axis; r18 to r20 are lost
+.macro along low_, high_, scale_, nodes_, cell, fraction
+    ld r18, X+
+    ld r19, X+
+    cp r18, \low_
+    cpc r19, \high_
+    ldi r20, 0xFF
+    brge 1f                     ; as long as the instruction it jumps over
+    ldi r20, 0
+1:
+    sub r18, \low_
+    sbc r19, \high_
+    and r18, r20
+    and r19, r20
+    mul r18, \scale_
+    mov r18, r1
+    mul r19, \scale_
+    mov \cell, r1
+    add r18, r0
+    brcc 2f                     ; as long as the instruction it jumps over
+    inc \cell
+2:
+    mov \fraction, r18
+    lsr \fraction
+    mov r18, \nodes_            ; the last cell
+    subi r18, 2
+    cp r18, \cell
+    sbc r20, r20                ; all ones beyond it
+    or \fraction, r20
+    andi \fraction, 0x7F
+    eor r18, \cell
+    and r18, r20
+    eor \cell, r18
+.endm
+
+    .section .text.sg_gp_find, "ax", @progbits
+    .global sg_gp_find
+    .type sg_gp_find, @function
+sg_gp_find:
+    push r4
+    push r5
+    push r6
+    push r7
+    push r8
+    push r9
+    push r10
+    push r11
+    push r12
+    push r13
+    push r28
+    push r29
+    movw r26, r24
+    movw r28, r18
+    movw r30, r22
+    movw grid0, r22
+    sbrs r20, 0                 ; SG_ROM_FLASH
+    rjmp 3f
+    description lpm
+    rjmp 4f
+3:
+    description ld
+4:
+    along from0, from1, scale0, wide, r22, r23
+    along from2, from3, scale1, tall, r24, r25
+    mul r23, r25                ; shares
+    lsl r0
+    rol r1                      ; r1: of the far corner
+    std Y+7, r1
+    sub r25, r1
+    std Y+6, r25
+    ldi r18, 128
+    sub r18, r23
+    sub r18, r25
+    std Y+4, r18
+    sub r23, r1
+    std Y+5, r23
+    mul r24, wide               ; node = elevation * wide + azimuth
+    movw r18, r0
+    ldi r25, 0
+    add r18, r22
+    adc r19, r25
+    movw r20, r18               ; five bytes each
+    lsl r20
+    rol r21
+    lsl r20
+    rol r21
+    add r18, r20
+    adc r19, r21
+    add r18, grid0
+    adc r19, grid1
+    subi r18, -80               ; SG_GP_GRID_FROM
+    sbci r19, -1
+    std Y+0, r18
+    std Y+1, r19
+    ldi r20, 5
+    mul wide, r20
+    add r18, r0
+    adc r19, r1
+    std Y+2, r18
+    std Y+3, r19
+    clr r1
+    pop r29
+    pop r28
+    pop r13
+    pop r12
+    pop r11
+    pop r10
+    pop r9
+    pop r8
+    pop r7
+    pop r6
+    pop r5
+    pop r4
+    ret
+    .size sg_gp_find, . - sg_gp_find
+
 ; void sg_gp_judge(const struct sg_gp_sum *sum r25:r24, const struct sg_gp_place *place r23:r22,
 ;                  const uint8_t *guard r21:r20, uint8_t space r18, struct sg_gp_opinion *opinion r17:r16)
 ; Y holds s >> 4, X the guard, Z what is read.

@@ -81,6 +81,55 @@ void sg_gp_trend(struct sg_gp_sum *sum, const uint8_t *bias, uint8_t space)
         start(sum, bias, SG_ROM_MEMORY);
 }
 
+uint8_t sg_gp_round(const struct sg_gp_sum *sum, uint8_t weight_frac_bits, int16_t deg_q7[2])
+{
+    uint8_t out = 0;
+    for (uint8_t i = 0; i < 2; i++) {
+        // 24 bits, Q.(weight_frac_bits + 8), to Q.17 and from there to Q8.7: most models have 9 bits already
+        int32_t acc = sg_q_signed32(sum->acc[i] << 8) >> 8;
+        for (uint8_t bits = weight_frac_bits; bits < 9; bits++)
+            acc *= 2;
+        const int32_t deg = ((acc >> 8) + 2) >> 2;
+        deg_q7[i] = sg_q_sat16(deg);
+        if (deg_q7[i] != deg)
+            out = SG_GP_OUT_OF_RANGE;
+    }
+    return out;
+}
+
+// Cell and fraction Q0.7 of one axis.
+static uint8_t along(int16_t deg_q7, int16_t origin_deg_q7, uint8_t scale, uint8_t nodes, uint8_t *cell)
+{
+    const uint8_t last = (uint8_t)(nodes - 2U);
+    *cell = 0;
+    if (deg_q7 < origin_deg_q7)
+        return 0;
+    const uint16_t difference = (uint16_t)((uint16_t)deg_q7 - (uint16_t)origin_deg_q7);  // below 3 * 2^14
+    const uint32_t t = (uint32_t)difference * scale;    // Q8.16
+    *cell = (uint8_t)(t >> 16);
+    if (*cell <= last)
+        return (uint8_t)((uint16_t)t >> 9);
+    *cell = last;
+    return 127;
+}
+
+void sg_gp_find(const int16_t deg_q7[2], const uint8_t *origin, uint8_t space, struct sg_gp_place *place)
+{
+    uint8_t cell[2], fraction_q7[2];
+    const uint8_t wide = sg_rom_byte(origin + 8, space);
+    for (uint8_t i = 0; i < 2; i++)
+        fraction_q7[i] = along(deg_q7[i], sg_q_signed16(sg_rom_u16(origin + 2U * i, space)),
+                               sg_rom_byte(origin + 6 + i, space), sg_rom_byte(origin + 8 + i, space), &cell[i]);
+    const uint8_t both = (uint8_t)((uint16_t)((uint16_t)fraction_q7[0] * fraction_q7[1]) >> 7);
+    place->share[3] = both;
+    place->share[2] = (uint8_t)(fraction_q7[1] - both);
+    place->share[1] = (uint8_t)(fraction_q7[0] - both);
+    place->share[0] = (uint8_t)(128U - fraction_q7[0] - place->share[2]);
+    const uint16_t node = (uint16_t)((uint16_t)((uint16_t)cell[1] * wide) + cell[0]);
+    place->node[0] = origin + SG_GP_GRID_FROM + node * SG_MODEL_NODE_BYTES;
+    place->node[1] = place->node[0] + (uint16_t)((uint16_t)wide * SG_MODEL_NODE_BYTES);
+}
+
 // 128 times the nodes' byte `at` at the place: below 2^15.
 static inline uint16_t blended(const struct sg_gp_place *place, uint8_t at, uint8_t space)
 {

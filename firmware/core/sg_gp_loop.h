@@ -37,6 +37,14 @@ uint8_t sg_gp_scale(struct sg_gp_sum *sum, const uint16_t feature[6], const uint
 //   bias   int32[2], and behind it the trend, int16[2][6], as stored, in `space`
 void sg_gp_trend(struct sg_gp_sum *sum, const uint8_t *bias, uint8_t space);
 
+// sum->acc to Q8.7, rounded half up. Returns 0, or SG_GP_OUT_OF_RANGE where an angle had to saturate.
+uint8_t sg_gp_round(const struct sg_gp_sum *sum, uint8_t weight_frac_bits, int16_t deg_q7[2]);
+
+// Find a gaze in the grid.
+//   origin   of struct sg_model_trust as stored, in `space`; scale and nodes follow, the grid SG_GP_GRID_FROM on
+enum { SG_GP_GRID_FROM = 80 };
+void sg_gp_find(const int16_t deg_q7[2], const uint8_t *origin, uint8_t space, struct sg_gp_place *place);
+
 // What the model says of a point, before its limit is asked.
 struct sg_gp_opinion {
     uint16_t doubt;             // m

@@ -15,7 +15,7 @@ import numpy as np
 
 from .errors import ModelError
 from .fields import put
-from .trust import Trust, sigma_deg
+from .trust import Trust, grid_bytes, sigma_deg
 
 MAGIC = 0x4D475A47
 VERSION = 2
@@ -358,8 +358,7 @@ def _checked(image):
             "fit the recording again with this version of sparsegaze",
         )
     length, n, d = int(head["length"]), int(head["vectors"]), int(head["channels"])
-    trust = Trust.unpack(image[PAGE_BYTES:])
-    grid = trust.grid_bytes
+    grid = grid_bytes(image[PAGE_BYTES:HEAD_BYTES])
     if not 1 <= n <= VECTORS_MAX or length != HEAD_BYTES + grid + n * RECORD_BYTES or length > SLOT_BYTES:
         raise ModelError(f"the model states {n} vectors in {length} bytes, which cannot be", _REFIT)
     if not 1 <= d <= CHANNELS:
@@ -373,6 +372,7 @@ def _checked(image):
         raise ModelError("the model is damaged (its checksum does not match)", _REFIT)
     unused = slice(d, CHANNELS)
     records = np.frombuffer(image, RECORD, n, HEAD_BYTES + grid)
+    trust = Trust.unpack(image[PAGE_BYTES : HEAD_BYTES + grid])
     if (
         head["kernel"] != KERNEL_RBF
         or head["weight_frac_bits"] not in WEIGHT_FRAC_BITS

@@ -59,7 +59,6 @@ class Trust:
     sigma_gain: int = 0
 
     guards = property(lambda self: len(self.base))
-    grid_bytes = property(lambda self: self.sigma.size * NODE_BYTES)
 
     def pack(self, channels):
         """(trust page, grid), bytes, for a model of so many channels. Raises ModelError."""
@@ -156,6 +155,12 @@ class Trust:
         for corner, share in enumerate(shares):
             total += share[:, None] * node[cell[1] + corner // 2, cell[0] + corner % 2]
         return total[:, :-1], total[:, -1]
+
+
+def grid_bytes(page):
+    """Bytes of the grid that a stored trust page states."""
+    wide, high = (int(v) for v in np.frombuffer(page, PAGE, 1)[0]["nodes"])
+    return wide * high * NODE_BYTES
 
 
 def sigma_deg(code):

@@ -9,7 +9,9 @@ from core_models import View, random_parts, seal
 from sparsegaze._core import ffi, lib
 
 HEAD = {name: field.offset for name, field in ffi.typeof("struct sg_model_head").fields}
+TRUST = {name: 128 + field.offset for name, field in ffi.typeof("struct sg_model_trust").fields}
 GUARD = {name: field.offset for name, field in ffi.typeof("struct sg_model_guard").fields}
+GRID = 5 * 5 * 4    # bytes of random_parts' grid
 
 
 def image(n=3, d=6, seed=0, **more):
@@ -42,14 +44,14 @@ def test_crc32_check_value_and_binascii_in_pieces():
 
 
 @pytest.mark.parametrize("d", range(1, 7))
-@pytest.mark.parametrize("n", [1, 64, 216])
-@pytest.mark.parametrize("guards", [0, 3, 8])
+@pytest.mark.parametrize("n", [1, 64, 226])
+@pytest.mark.parametrize("guards", [0, 3, 4])
 def test_opens_and_describes_what_was_stored(n, d, guards):
     data = image(n, d, guards=guards, weight_frac_bits=7, generation=0xFFFFFFFE)
     view = View(data)
     assert view.verdict == lib.SG_OK
     v = view.view
-    assert (v.vectors, v.channels, v.guards, v.weight_frac_bits) == (n, d, guards, 7)
+    assert (v.vectors, v.channels, v.records, v.weight_frac_bits) == (n, d, 256 + GRID, 7)
     assert (v.generation, v.length, v.crc) == (0xFFFFFFFE, len(data), binascii.crc32(data[8:]))
     assert v.image == view.bytes
     assert lib.sg_model_length(view.bytes, len(data), 0) == len(data)
@@ -84,22 +86,23 @@ def test_erased_and_blank_slots_are_no_model(fill):
     assert verdict(b"") == lib.SG_E_SHORT
 
 
-@pytest.mark.parametrize("version", [0, 2, 0x0100, 0xFFFF])
+@pytest.mark.parametrize("version", [0, 1, 3, 0x0100, 0xFFFF])
 def test_another_format_version_is_named_before_its_fields_are_judged(version):
     bad = changed(image(), HEAD["version"], version & 255, version >> 8, 250, 99)
     assert verdict(bad) == lib.SG_E_VERSION
 
 
-@pytest.mark.parametrize("vectors", [0, 2, 4, 217, 255])
+@pytest.mark.parametrize("vectors", [0, 2, 4, 234, 255])
 def test_a_vector_count_that_does_not_fit_the_length_is_refused(vectors):
     assert verdict(changed(image(n=3), HEAD["vectors"], vectors)) == lib.SG_E_BOUNDS
 
 
-def test_217_vectors_are_refused_although_the_room_would_do():
-    data = bytearray(image(n=216)) + bytes(13)
-    data[HEAD["vectors"]] = 217
+def test_a_model_longer_than_a_slot_is_refused_although_the_room_would_do():
+    data = bytearray(image(n=226)) + bytes(12)
+    assert verdict(bytes(data)) == lib.SG_OK
+    data[HEAD["vectors"]] = 227
     data[HEAD["length"]:HEAD["length"] + 4] = len(data).to_bytes(4, "little")
-    assert verdict(seal(bytes(data))) == lib.SG_E_BOUNDS
+    assert len(data) > 3072 and verdict(seal(bytes(data))) == lib.SG_E_BOUNDS
 
 
 @pytest.mark.parametrize("length", [0, 255, 256, 0x10000 + 295, 0xFFFFFFFF])
@@ -108,23 +111,47 @@ def test_a_length_that_does_not_fit_the_vectors_is_refused(length):
 
 
 @pytest.mark.parametrize("name,values", [
-    ("channels", (0, 7, 255)), ("kernel", (1, 255)), ("weight_frac_bits", (0, 5, 11, 255)),
-    ("guards", (9, 255)),
-    ("reserved", (1, 128))])
+    ("channels", (0, 7, 255)), ("kernel", (1, 255)), ("weight_frac_bits", (0, 4, 10, 255)), ("pad", (1, 128))])
 def test_a_head_field_outside_its_range_is_refused_under_a_good_crc(name, values):
     for value in values:
         assert verdict(changed(image(), HEAD[name], value)) == lib.SG_E_BOUNDS, value
 
 
-def test_every_pad_and_reserved_byte_must_be_zero():
+@pytest.mark.parametrize("name,values", [
+    ("guards", (5, 255)), ("scale", (0,)), ("nodes", (0, 1, 25, 255)), ("pad", (1, 128))])
+def test_a_trust_field_outside_its_range_is_refused_under_a_good_crc(name, values):
+    for value in values:
+        assert verdict(changed(image(), TRUST[name], value)) == lib.SG_E_BOUNDS, value
+
+
+def test_biases_origins_bases_and_rows_hold_at_their_limits_and_fail_one_step_beyond():
+    data = image(guards=1)
+    for at, size, limit in ((HEAD["bias"], 4, 1 << 30), (HEAD["bias"] + 4, 4, 1 << 30),
+                            (TRUST["origin_deg_q7"], 2, 1 << 14), (TRUST["origin_deg_q7"] + 2, 2, 1 << 14),
+                            (128 + GUARD["base"], 2, 14336)):
+        for sign in (1, -1):
+            for value, expected in ((limit, lib.SG_OK), (limit + 1, lib.SG_E_BOUNDS)):
+                raw = (sign * value).to_bytes(size, "little", signed=True)
+                assert verdict(changed(data, at, *raw)) == expected, (at, sign * value)
+    for row, expected in (([63, 0, 0, 0, 0, 0], lib.SG_OK), ([0, 0, -63, 0, 0, 0], lib.SG_OK),
+                          ([64, 0, 0, 0, 0, 0], lib.SG_E_BOUNDS), ([-11, 11, -11, 11, -11, 9], lib.SG_E_BOUNDS),
+                          ([-128] * 6, lib.SG_E_BOUNDS)):
+        assert verdict(changed(data, 128 + GUARD["row"], *[v & 255 for v in row])) == expected, row
+
+
+def test_every_pad_byte_unused_guard_and_expectation_must_be_zero():
     data = image(guards=2)
-    for at in range(HEAD["pad"], 128):
-        assert verdict(changed(data, at, 1)) == lib.SG_E_BOUNDS
-    for row in range(2):
-        for at in (GUARD["reserved"], GUARD["reserved"] + 1):
-            assert verdict(changed(data, 128 + 16 * row + at, 1)) == lib.SG_E_BOUNDS
-    for at in range(128 + 2 * 16, 256):     # rows that are not in use
-        assert verdict(changed(data, at, 1)) == lib.SG_E_BOUNDS
+    for at in [*range(HEAD["pad"], 128), *range(128 + 2 * 12, 128 + 4 * 12), *range(TRUST["pad"], 256)]:
+        assert verdict(changed(data, at, 1)) == lib.SG_E_BOUNDS, at
+    for node in range(20):
+        for at in (2, 3):       # expectations of guards that are not in use
+            assert verdict(changed(data, 256 + 5 * node + at, 1)) == lib.SG_E_BOUNDS
+
+
+def test_an_offset_without_gain_is_refused():
+    data = changed(image(), HEAD["gain_q12"], 0, 0)
+    assert verdict(data) == lib.SG_E_BOUNDS
+    assert verdict(changed(data, HEAD["offset"], 0, 0)) == lib.SG_OK
 
 
 @pytest.mark.parametrize("d", range(1, 6))
@@ -132,8 +159,9 @@ def test_every_byte_of_an_unused_channel_must_be_zero(d):
     data = image(n=2, d=d, guards=1)
     places = []
     for j in range(d, 6):
-        places += [HEAD["offset"] + 2 * j, HEAD["gain_q12"] + 2 * j + 1, HEAD["trend"] + 4 * j,
-                   HEAD["trend"] + 24 + 4 * j + 3, 128 + GUARD["row"] + j, 256 + 3 + j, 256 + 13 + 3 + j]
+        places += [HEAD["offset"] + 2 * j, HEAD["gain_q12"] + 2 * j + 1, HEAD["trend"] + 2 * j,
+                   HEAD["trend"] + 12 + 2 * j + 1, 128 + GUARD["row"] + j, 256 + GRID + 2 + j,
+                   256 + GRID + 12 + 2 + j]
     for at in places:
         assert verdict(changed(data, at, 1)) == lib.SG_E_BOUNDS, at
 
@@ -152,20 +180,22 @@ def test_guard_limits_are_compared_as_signed():
     data = image(guards=1)
 
     def with_limits(low, high):
-        limits = low.to_bytes(4, "little", signed=True) + high.to_bytes(4, "little", signed=True)
-        return changed(data, 128, *limits)
+        limits = low.to_bytes(2, "little", signed=True) + high.to_bytes(2, "little", signed=True)
+        return changed(data, 128 + GUARD["low"], *limits)
 
-    for low, high in ((-1, 0), (-2 ** 31, 2 ** 31 - 1), (5, 5), (-6, -5)):
+    for low, high in ((-1, 0), (-2 ** 15, 2 ** 15 - 1), (5, 5), (-6, -5)):
         assert verdict(with_limits(low, high)) == lib.SG_OK
-    for low, high in ((0, -1), (2 ** 31 - 1, -2 ** 31), (6, 5), (-5, -6)):
+    for low, high in ((0, -1), (2 ** 15 - 1, -2 ** 15), (6, 5), (-5, -6)):
         assert verdict(with_limits(low, high)) == lib.SG_E_BOUNDS
 
 
-def test_half_c2_of_2_to_the_22_is_refused_in_any_record():
+def test_a_half_c2_that_is_not_its_centres_is_refused_in_any_record():
     data = image(n=3)
     for i in range(3):
-        assert verdict(changed(data, 256 + 13 * i, 0xFF, 0xFF, 0x3F)) == lib.SG_OK
-        assert verdict(changed(data, 256 + 13 * i, 0x00, 0x00, 0x40)) == lib.SG_E_BOUNDS
+        at = 256 + GRID + 12 * i
+        half = int.from_bytes(data[at:at + 2], "little")
+        for wrong in (half - 1, half + 1, 0, 0xFFFF):
+            assert verdict(changed(data, at, *wrong.to_bytes(2, "little"))) == lib.SG_E_BOUNDS
 
 
 def test_a_crc_made_in_pieces_opens_the_same_and_a_wrong_one_does_not():

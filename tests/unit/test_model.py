@@ -7,9 +7,26 @@ import numpy as np
 import pytest
 
 from sparsegaze import model as m
+from sparsegaze import trust as t
 from sparsegaze._core import ffi, lib
 from sparsegaze.errors import ModelError
-from sparsegaze.model import DeviceModel, emulate
+from sparsegaze.model import DeviceModel, emulate, emulate_point
+from sparsegaze.trust import Trust, sigma_deg
+
+
+def trust(rng, d=6, guards=3, nodes=(4, 7)):
+    return Trust(
+        rng.integers(-10, 11, (guards, d)),
+        rng.integers(-2000, 2000, guards),
+        rng.integers(-4000, -1000, guards),
+        rng.integers(1000, 4000, guards),
+        rng.integers(0, 256, (*nodes, guards)),
+        rng.integers(0, 256, nodes),
+        rng.integers(-3000, 0, 2),
+        rng.integers(1, 256, 2),
+        int(rng.integers(0, 65536)),
+        int(rng.integers(0, 256)),
+    )
 
 
 def parts(seed=0, n=64, d=6, bits=8, guards=3, gain_top=4096):
@@ -17,12 +34,12 @@ def parts(seed=0, n=64, d=6, bits=8, guards=3, gain_top=4096):
     return dict(
         offset=rng.integers(0, 3000, d),
         gain_q12=rng.integers(1, gain_top + 1, d),
-        bias=rng.integers(-(2**28), 2**28, 2),
-        trend=rng.integers(-(2**14), 2**14, (2, d)),
+        bias=rng.integers(-(2**26), 2**26, 2),
+        trend=rng.integers(-3000, 3000, (2, d)),
         centres=rng.integers(0, 256, (n, d)),
         weights=rng.integers(-32768, 32768, (n, 2)),
         weight_frac_bits=bits,
-        guards=[(-(10**6), 10**6, rng.integers(-128, 128, d)) for _ in range(guards)],
+        trust=trust(rng, d, guards) if guards else None,
     )
 
 
@@ -32,11 +49,17 @@ def assert_same(model, features, recentre=(0.0, 0.0)):
     np.testing.assert_array_equal(az * 128, az_q7)
     np.testing.assert_array_equal(el * 128, el_q7)
     np.testing.assert_array_equal(flags, expected)
+    judged, (q7, outside, doubt, code) = model.judge(features), emulate_point(model, features)
+    np.testing.assert_array_equal(judged.gaze_deg * 128, np.clip(q7, -32768, 32767))
+    np.testing.assert_array_equal(judged.outside, outside)
+    np.testing.assert_array_equal(judged.doubt * 256, doubt)
+    np.testing.assert_array_equal(judged.sigma_deg, sigma_deg(code))
     return flags
 
 
 @pytest.mark.parametrize(
-    "name, dtype", [("struct sg_model_head", m.HEAD), ("struct sg_model_guard", m.GUARD)]
+    "name, dtype",
+    [("struct sg_model_head", m.HEAD), ("struct sg_model_guard", t.GUARD), ("struct sg_model_trust", t.PAGE)],
 )
 def test_layout_is_that_of_the_c_header(name, dtype):
     ctype = ffi.typeof(name)
@@ -50,7 +73,10 @@ def test_layout_is_that_of_the_c_header(name, dtype):
 def test_limits_are_those_of_the_c_headers():
     for name in ("MAGIC", "VERSION", "HEAD_BYTES", "RECORD_BYTES", "CHANNELS", "SLOT_BYTES", "VECTORS_MAX"):
         assert getattr(m, name) == getattr(lib, "SG_MODEL_" + name)
-    assert m.PAGE_BYTES == lib.SG_MODEL_PAGE
+    assert m.PAGE_BYTES == t.PAGE_BYTES == lib.SG_MODEL_PAGE
+    assert (t.GUARDS, t.NODES_MAX, t.NODE_BYTES) == (
+        lib.SG_MODEL_GUARDS, lib.SG_MODEL_NODES_MAX, lib.SG_MODEL_NODE_BYTES,
+    )
     assert m.RECORD.itemsize == m.RECORD_BYTES
     for name in ("VALID", "NO_MODEL", "OUT_OF_RANGE", "SATURATED", "STARVED"):
         assert getattr(m, "FLAG_" + name) == getattr(lib, "SG_FLAG_" + name)
@@ -62,8 +88,8 @@ def test_parts_come_back_as_they_went_in():
     for name in ("offset", "gain_q12", "bias", "trend", "centres", "weights"):
         np.testing.assert_array_equal(getattr(model, name), given[name])
     assert (model.generation, model.vectors, model.channels, model.weight_frac_bits) == (5, 64, 6, 8)
-    np.testing.assert_array_equal(model.half_c2, 8 * (given["centres"] ** 2).sum(1))
-    assert len(model.guards) == 3 and model.guards[0][:2] == (-(10**6), 10**6)
+    for name in Trust.__dataclass_fields__:
+        np.testing.assert_array_equal(getattr(model.trust, name), getattr(given["trust"], name))
     assert (
         model.crc
         == zlib.crc32(model.image[8:])
@@ -82,12 +108,12 @@ def test_generation_changes_nothing_else():
 @pytest.mark.parametrize("seed", range(12))
 def test_emulation_equals_the_core_bit_for_bit_on_random_models(seed):
     rng = np.random.default_rng(seed)
-    d, n = int(rng.integers(1, 7)), int(rng.integers(1, m.VECTORS_MAX + 1))
-    model = DeviceModel.from_parts(**parts(seed, n, d, 6 + seed % 5, seed % 9, 65535 if seed % 2 else 4096))
+    d, n = int(rng.integers(1, 7)), int(rng.integers(1, 220))
+    model = DeviceModel.from_parts(**parts(seed, n, d, 5 + seed % 5, seed % 5, 65535 if seed % 2 else 4096))
     features = rng.integers(0, 65536, (1500, d)).astype(np.uint16)
     features[::2] = model.offset[:d] + rng.integers(0, 4095 * 4096 // model.gain_q12.max(), (750, d))
     flags = assert_same(model, features, rng.uniform(-100, 100, 2))
-    assert model.weight_frac_bits < 8 or model.guards or set(flags[::2]) == {m.FLAG_VALID}
+    assert model.weight_frac_bits < 8 or model.trust.guards or set(flags[::2]) == {m.FLAG_VALID}
     assert m.FLAG_OUT_OF_RANGE in flags[1::2]
 
 
@@ -103,11 +129,11 @@ def test_emulation_equals_the_core_on_every_corner_and_centre():
 
 
 def test_emulation_equals_the_core_over_the_whole_kernel():
-    # One channel, one vector at 0: T runs through every table entry up to the end of the kernel.
-    model = DeviceModel.from_parts([0], [4096], [0, 0], [[0], [0]], [[0]], [[32767, -32768]], 6)
+    # One channel, one vector at 0: T runs through every table entry; six channels: to the end of the kernel.
+    model = DeviceModel.from_parts([0], [4096], [0, 0], [[0], [0]], [[0]], [[32767, -32768]], 5)
     assert_same(model, np.arange(65536, dtype=np.uint16)[:, None])
     far = DeviceModel.from_parts(
-        [0] * 6, [4096] * 6, [0, 0], np.zeros((2, 6), int), [[0] * 6], [[32767, -32768]], 6
+        [0] * 6, [4096] * 6, [0, 0], np.zeros((2, 6), int), [[0] * 6], [[32767, -32768]], 5
     )
     steps = np.linspace(0, 4095, 4000).astype(np.uint16)
     assert_same(far, np.repeat(steps[:, None], 6, axis=1))
@@ -115,18 +141,17 @@ def test_emulation_equals_the_core_over_the_whole_kernel():
 
 def test_kernel_is_the_exponential_within_its_bound():
     rng = np.random.default_rng(1)
-    s, c = rng.integers(0, 4096, (400, 6)), rng.integers(0, 256, (50, 6))
-    exact = 65536 * np.exp(-0.5 * ((s[:, None] / 16 - c) ** 2).sum(-1) / m.U_STEPS**2)
-    worst = np.abs(m.kernel_q16(s, c) - exact).max()
-    assert worst <= 2.2
+    s, c = rng.integers(1600, 2500, (400, 6)), rng.integers(100, 156, (50, 6))
+    t = (s * s).sum(1)[:, None] / 32 + 256 * m.half_squares(c) - s @ c.T
+    assert np.abs(m.kernel_q16(s, c) - 65536 * np.exp(-t / 65536)).max() <= 4
 
 
 def test_saturated_output_and_recentre_are_flagged():
-    model = DeviceModel.from_parts([0], [4096], [2**31 - 1, 0], [[0], [0]], [[0]], [[0, 0]], 6)
+    model = DeviceModel.from_parts([0], [4096], [2**26, 0], [[0], [0]], [[0]], [[0, 0]], 5)
     assert assert_same(model, np.zeros((1, 1), np.uint16)).tolist() == [m.FLAG_OUT_OF_RANGE]
     model = DeviceModel.from_parts([0], [4096], [0, 0], [[0], [0]], [[0]], [[0, 0]], 8)
     assert assert_same(model, np.zeros((1, 1), np.uint16), (255.0, 0)).tolist() == [m.FLAG_VALID]
-    model = DeviceModel.from_parts([0], [4096], [2**31 - 1, 0], [[0], [0]], [[0]], [[0, 0]], 8)
+    model = DeviceModel.from_parts([0], [4096], [2**26, 0], [[0], [0]], [[0]], [[0, 0]], 8)
     assert assert_same(model, np.zeros((1, 1), np.uint16), (200.0, 0)).tolist() == [m.FLAG_OUT_OF_RANGE]
 
 
@@ -180,7 +205,7 @@ def _resealed(image, field, value):
 @pytest.mark.parametrize(
     "field, value, words",
     [
-        ("version", 2, "version 2"),
+        ("version", 1, "version 1"),
         ("vectors", 0, "0 vectors"),
         ("vectors", 63, "63 vectors"),
         ("length", 5, "vectors"),
@@ -188,16 +213,37 @@ def _resealed(image, field, value):
         ("channels", 7, "7 channels"),
         ("channels", 5, "does not allow"),
         ("kernel", 1, "does not allow"),
-        ("weight_frac_bits", 11, "does not allow"),
-        ("guards", 9, "does not allow"),
-        ("guards", 2, "does not allow"),
-        ("reserved", 1, "does not allow"),
+        ("weight_frac_bits", 10, "does not allow"),
+        ("bias", 2**30 + 1, "does not allow"),
         ("pad", 1, "does not allow"),
     ],
 )
 def test_well_sealed_nonsense_is_refused_here_and_by_the_core(field, value, words):
     bad = _resealed(DeviceModel.from_parts(**parts()).image, field, value)
     with pytest.raises(ModelError, match=words):
+        DeviceModel(bad)
+    assert lib.sg_model_open(ffi.new("struct sg_model_view *"), bad, len(bad), 0) < 0
+
+
+@pytest.mark.parametrize(
+    "field, value",
+    [
+        ("guards", 5),
+        ("guards", 2),
+        ("scale", 0),
+        ("nodes", 0),
+        ("nodes", 1),
+        ("nodes", 25),
+        ("origin_deg_q7", 16385),
+        ("pad", 1),
+    ],
+)
+def test_well_sealed_nonsense_in_the_trust_page_is_refused_here_and_by_the_core(field, value):
+    image = DeviceModel.from_parts(**parts()).image
+    page = np.frombuffer(image, t.PAGE, 1, m.PAGE_BYTES).copy()
+    page[field] = value
+    bad = m._sealed(image[: m.PAGE_BYTES] + page.tobytes() + image[m.HEAD_BYTES :])
+    with pytest.raises(ModelError):
         DeviceModel(bad)
     assert lib.sg_model_open(ffi.new("struct sg_model_view *"), bad, len(bad), 0) < 0
 
@@ -236,7 +282,7 @@ def test_features_of_another_dimension_are_refused():
         ("gain_q12", 65536),
         ("offset", -1),
         ("bias", 2**31),
-        ("trend", -(2**31) - 1),
+        ("trend", 2**15),
     ],
 )
 def test_a_value_that_its_field_cannot_hold_is_refused_instead_of_wrapping(field, value):
@@ -248,7 +294,9 @@ def test_a_value_that_its_field_cannot_hold_is_refused_instead_of_wrapping(field
 
 
 def test_too_many_vectors_and_guards_are_refused():
-    with pytest.raises(ModelError, match="217"):
-        DeviceModel.from_parts(**parts(n=217))
-    with pytest.raises(ModelError, match="9 guards"):
-        DeviceModel.from_parts(**parts(guards=9))
+    with pytest.raises(ModelError, match="234 calibration vectors do not fit a slot of 233"):
+        DeviceModel.from_parts(**parts(n=234, guards=0))
+    with pytest.raises(ModelError, match="ask for 1 to 223"):
+        DeviceModel.from_parts(**parts(n=224))
+    with pytest.raises(ModelError, match="5 guards"):
+        DeviceModel.from_parts(**parts(guards=5))
