@@ -21,8 +21,9 @@ GAIN_SIGMA = 0.05
 POINTS_LEAST, POINTS_MOST = 3, 9
 GAIN_STEP = 1 / 512
 GAIN_LIMIT = GAIN_STEPS_MAX * GAIN_STEP
-# A gain has to be better than the offset alone by so much, a correction better than none.
-WORTH = 0.95
+# A gain has to be better than the offset alone by so much, a correction better than none; and by more than
+# the device's own rounding may explain.
+WORTH, WORTH_DEG = 0.95, 0.05
 
 
 class Correction(NamedTuple):
@@ -73,7 +74,7 @@ def fit(model_deg, target_deg, offset_deg=(0.0, 0.0), gain=((0.0, 0.0), (0.0, 0.
     shrunken, affine = _ridge(g, miss)
     steps = np.clip(np.round(shrunken / GAIN_STEP), -GAIN_STEPS_MAX, GAIN_STEPS_MAX)
     kind = "affine" if affine < WORTH * alone else "offset"
-    if min(affine, alone) >= WORTH * before:
+    if min(affine, alone) > min(WORTH * before, before - WORTH_DEG):
         return Correction(tuple(offset_deg), _rows(gain), "none", before, alone, affine)
     # The best offset for the gain as it is rounded.
     rounded = steps * GAIN_STEP if kind == "affine" else np.zeros((2, 2))

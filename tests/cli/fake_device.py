@@ -90,7 +90,7 @@ class FakeDevice:
     """What session, capture, validate, recentre and live use of Device.
 
     model       DeviceModel or None;  noise feature steps rms;  shift_deg: where the eye really looks, off the
-                target
+                target;  warp: 2 x 2, what a shifted headset makes of where the eye looks
     blinks      [(begin_us, end_us)];  raw_flags: function t_us -> flags
     unplug_us   the cable is pulled then;  interrupt_us: Ctrl-C then;  drop: sequence numbers that get lost
     spoil       function (seq, Gaze) -> Gaze, for gazes that the host would not compute
@@ -101,6 +101,7 @@ class FakeDevice:
         model=None,
         noise=8.0,
         shift_deg=(0.0, 0.0),
+        warp=((1.0, 0.0), (0.0, 1.0)),
         blinks=(),
         raw_flags=None,
         unplug_us=None,
@@ -115,6 +116,7 @@ class FakeDevice:
             np.array(shift_deg, float),
             list(blinks),
         )
+        self.warp = np.array(warp, float)
         self.raw_flags = raw_flags or (lambda t_us: 0)
         self.unplug_us, self.interrupt_us, self.drop, self.spoil = unplug_us, interrupt_us, set(drop), spoil
         self.rng = np.random.default_rng(seed)
@@ -181,7 +183,7 @@ class FakeDevice:
             if self.seq in self.drop:
                 self.lost += 1
                 continue
-            signal = MIDDLE + OPTICS @ self.eye_deg(self.t_us) + self.rng.normal(0, self.noise, 6)
+            signal = MIDDLE + OPTICS @ self.warp @ self.eye_deg(self.t_us) + self.rng.normal(0, self.noise, 6)
             if any(begin <= self.t_us < end for begin, end in self.blinks):
                 signal += 1500
             feature = np.clip(np.round(signal), 0, 65535).astype(np.uint16)

@@ -235,6 +235,48 @@ def test_recentre_and_clear(command_json, fake):
     assert code == 0 and data["after_deg"] == [0.0, 0.0]
 
 
+def test_recentre_with_points_sets_a_gain_that_stream_and_replay_carry(command, command_json, fake, tmp_path):
+    device = fake(linear_model(), shift_deg=(2.0, -3.0), warp=((1.12, 0.05), (-0.06, 0.9)))
+    code, data, _ = command_json("recentre", "PORT", "--points", "5")
+    assert code == 0 and data["applied"] == "affine" and len(data["points"]) == 5
+    assert data["predicted_error_deg"] < data["offset_error_deg"] < data["error_deg"]
+    assert data["after_gain"] == [list(row) for row in device.recentre().affine.gain] != data["before_gain"]
+    gaze, model = tmp_path / "gaze.csv", tmp_path / "eye.sgm"
+    device.model.save(model)
+    assert command_json("stream", "PORT", "--seconds", "1", "--csv", gaze)[0] == 0
+    assert command_json("replay", gaze, "--model", model)[1]["identical"] is True
+    lines = gaze.read_text().splitlines()
+    head = next(i for i, line in enumerate(lines) if line.startswith("t_us"))
+    column = lines[head].split(",").index("recentre_el_el")
+    row = lines[head + 20].split(",")
+    row[column] = "0.0"
+    gaze.write_text("\n".join(lines[: head + 20] + [",".join(row)] + lines[head + 21 :]) + "\n")
+    assert command_json("replay", gaze, "--model", model)[1]["differing"] == 1
+    code, out, _ = command("recentre", "PORT", "--points", "5")
+    assert code == 0 and "all stays as it was" in out and "gain, percent" in out
+    code, data, _ = command_json("recentre", "PORT", "--clear")
+    assert code == 0 and data["after_gain"] == [[0.0, 0.0], [0.0, 0.0]]
+
+
+@pytest.mark.parametrize("points, word", [("2", "cannot tell a gain"), ("0", "1<=x<=9"), ("10", "1<=x<=9")])
+def test_recentre_with_a_number_of_points_that_makes_no_sense(command, fake, points, word):
+    fake(linear_model())
+    code, out, err = command("recentre", "PORT", "--points", points)
+    assert code != 0 and word in out + err and "Traceback" not in out + err
+
+
+def test_a_stream_from_before_gains_and_sigma_still_replays(command_json, fake, tmp_path):
+    device = fake(linear_model())
+    device.recentre((0.5, -1.25))
+    gaze, model = tmp_path / "gaze.csv", tmp_path / "eye.sgm"
+    device.model.save(model)
+    assert command_json("stream", "PORT", "--seconds", "1", "--csv", gaze)[0] == 0
+    old = [line if line.startswith("#") else ",".join(line.split(",")[:14]) for line in gaze.read_text().splitlines()]
+    gaze.write_text("\n".join(old) + "\n")
+    code, data, _ = command_json("replay", gaze, "--model", model)
+    assert code == 0 and data["identical"] is True and data["compared"] > 250
+
+
 def fake_upload(monkeypatch, device, error=None):
     def upload(link, model, progress=None):
         if error:

@@ -272,3 +272,84 @@ def test_recentre_without_a_model_says_so():
     device = FakeDevice()
     with pytest.raises(CalibrationError, match="no model"):
         recentre.run(device, device.screen)
+
+
+WARP = ((1.10, 0.04), (-0.05, 0.92))
+
+
+def test_five_points_take_most_of_a_warp_away_that_one_point_leaves():
+    device = FakeDevice(linear_model(), shift_deg=(2.0, -1.0), warp=WARP)
+    one = recentre.run(device, device.screen)
+    assert one.after_gain == recentre.NO_GAIN and one.applied == "offset"
+    five = recentre.run_points(device, device.screen, 5)
+    assert five.applied == "affine" and five.before_deg == one.after_deg and len(five.points) == 5
+    assert five.after_gain == device.recentre().affine.gain != recentre.NO_GAIN
+    assert five.predicted_error_deg < 0.8 * five.offset_error_deg and five.error_deg > five.predicted_error_deg
+    again = recentre.run_points(device, device.screen, 5)
+    assert again.error_deg < 0.5 * five.error_deg and again.before_gain == five.after_gain
+    assert again.applied == "none" and device.recentre().affine.gain == five.after_gain
+
+
+def test_points_without_a_shift_leave_all_as_it_was():
+    device = FakeDevice(linear_model(), noise=0.5)
+    report = recentre.run_points(device, device.screen, 5)
+    assert report.applied == "none" and device.stored_us is None
+    assert report.after_deg == report.before_deg and report.predicted_error_deg == report.error_deg < 0.05
+
+
+def test_one_point_leaves_a_gain_in_force_alone_and_clear_takes_it_away():
+    device = FakeDevice(linear_model(), shift_deg=(1.0, 1.0))
+    device.recentre((0.5, 0.5), [[0.1, 0.0], [0.0, -0.1]])
+    before = device.recentre().affine
+    report = recentre.run(device, device.screen, (10.0, 5.0))
+    assert report.before_gain == report.after_gain == before.gain
+    assert recentre.run(device, device.screen, (10.0, 5.0)).error_deg < 0.05
+    assert recentre.keep(device).affine.gain == recentre.NO_GAIN
+
+
+def test_the_points_are_seen_through_the_correction_in_force():
+    plain = FakeDevice(linear_model(), warp=WARP, noise=0.0)
+    corrected = FakeDevice(linear_model(), warp=WARP, noise=0.0)
+    corrected.recentre((3.0, -2.0), [[-0.05, 0.1], [0.2, 0.15]])
+    found = [recentre.run_points(device, device.screen, 7) for device in (plain, corrected)]
+    assert np.allclose(found[0].after_deg, found[1].after_deg, atol=0.02)
+    assert np.allclose(found[0].after_gain, found[1].after_gain, atol=1.01 / 512)
+
+
+def test_a_point_without_a_valid_gaze_is_left_out_and_three_are_the_least():
+    def lids(t_us):         # shut long enough for the point to be given up: the second point
+        return lib.SG_FLAG_STARVED if 3_200_000 < t_us < until_us else 0
+
+    until_us = 9_500_000
+    device = FakeDevice(linear_model(), shift_deg=(2.0, 0.0), raw_flags=lids)
+    report = recentre.run_points(device, device.screen, 5)
+    left_out = [row for row in report.points if row["gaze_deg"] is None]
+    assert len(left_out) == 1 and "valid gaze" in left_out[0]["reason"] and report.applied != "none"
+    assert np.allclose(report.after_deg, (-2.0, 0.0), atol=0.1)
+    until_us = 2**40
+    device = FakeDevice(linear_model(), shift_deg=(2.0, 0.0), raw_flags=lids)
+    with pytest.raises(CalibrationError, match="only 1 of 5 points .* valid gaze"):
+        recentre.run_points(device, device.screen, 5)
+    assert device.recentre().affine.offset_deg == (0.0, 0.0)
+
+
+def test_a_cable_pulled_between_points_is_told_as_such_and_changes_nothing():
+    device = FakeDevice(linear_model(), shift_deg=(2.0, 0.0), unplug_us=5_000_000)
+    with pytest.raises(DisconnectedError, match="gone"):
+        recentre.run_points(device, device.screen, 5)
+    assert device.affine.offset_deg == (0.0, 0.0) and device.stored_us is None
+
+
+def test_a_recentre_with_gain_during_the_stream_stays_bit_identical(held_out):
+    device = FakeDevice(linear_model())
+    run = session.run(
+        device,
+        device.screen,
+        held_out,
+        gaze=True,
+        on_frame=lambda frame: device.recentre((0.5, 1.0), [[0.05, -0.1], [0.0, 0.2]])
+        if frame.seq == 1500
+        else None,
+    )
+    assert len(np.unique(run.frames["recentre"]["gain_q9"], axis=0)) == 2
+    assert validate.evaluate(run, device.model).bit_identical

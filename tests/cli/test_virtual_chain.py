@@ -106,6 +106,10 @@ def test_recentre_stays_over_a_restart_and_in_the_replay(command_json, nano, kep
     assert command_json("info", nano.port)[1]["recentre_deg"] == offset
     command_json("stream", nano.port, "--seconds", "1", "--csv", kept / "shifted.csv")
     assert command_json("replay", kept / "shifted.csv", "--model", kept / "model.sgm")[1]["identical"] is True
+    code, data, _ = command_json("recentre", nano.port, "--points", "5")
+    assert code == 0 and data["before_deg"] == offset and data["applied"] in ("none", "offset", "affine")
+    info = command_json("info", nano.port)[1]
+    assert info["recentre_deg"] == data["after_deg"] and info["recentre_gain"] == data["after_gain"]
     assert command_json("recentre", nano.port, "--clear")[1]["after_deg"] == [0.0, 0.0]
 
 
