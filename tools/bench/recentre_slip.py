@@ -32,7 +32,8 @@ FIRMWARE = ROOT / "host_sdk" / "sparsegaze" / "data" / "firmware.hex"
 FIRST_PERSON = 2000
 TARGETS, HELD_OUT = 120, 25
 # Coarser than the product's map: lids and pupil matter little here, and each slip takes a map of its own.
-COARSE = {"pupil_mm": (2.0, 3.0, 4.0, 5.0, 6.5, 8.0), "lid_opening": np.linspace(0, 1, 21), "check_states": 40}
+COARSE = {"pupil_mm": (2.0, 3.5, 5.0, 8.0), "smooth_nodes": 21, "lid_opening": np.linspace(0, 1, 11),
+          "check_states": 10}
 
 
 def direction(seed):
