@@ -147,6 +147,7 @@ int sg_mlp_open(struct sg_mlp_view *view, const uint8_t *image, uint32_t room, u
         return SG_E_BOUNDS;
     const uint8_t *at = image + SG_MLP_HEAD_BYTES;
     uint8_t widest = even(inputs);
+    uint8_t wide = 0;
     for (uint8_t k = 0; k <= hidden; k++) {
         const struct layer layer = layer_at(image, space, k);
         at = checked_layer(at, &layer, space);
@@ -154,6 +155,8 @@ int sg_mlp_open(struct sg_mlp_view *view, const uint8_t *image, uint32_t room, u
             return SG_E_BOUNDS;
         if (layer.rows > widest)
             widest = layer.rows;
+        if (layer.weight_bytes == 2)
+            wide |= (uint8_t)(1U << k);
     }
 
     view->image = image;
@@ -163,6 +166,9 @@ int sg_mlp_open(struct sg_mlp_view *view, const uint8_t *image, uint32_t room, u
     view->inputs = inputs;
     view->outputs = sg_rom_byte(image + HEAD(outputs), space);
     view->hidden = hidden;
+    for (uint8_t k = 0; k < SG_MLP_HIDDEN_MAX; k++)
+        view->width[k] = sg_rom_byte(image + HEAD(width) + k, space);
+    view->wide = wide;
     view->scratch_words = (uint8_t)(2U * widest);
     view->reserved = 0;
     return SG_OK;
@@ -178,15 +184,16 @@ int sg_mlp_predict(const struct sg_mlp_view *view, const uint16_t *input, uint16
     run.space = view->space;
     run.saturated = 0;
     const uint8_t clamped = sg_mlp_scale(input, in, view->image + HEAD(input), view->inputs, view->space);
-    for (uint8_t k = 0; k <= view->hidden; k++) {
-        const struct layer layer = layer_at(view->image, view->space, k);
-        run.columns = layer.columns;
-        run.rows = layer.rows;
-        run.kind = (layer.weight_bytes == 2 ? SG_MLP_WIDE : 0);
-        if (k == view->hidden)
-            run.kind |= SG_MLP_OUTPUT;
+    const uint8_t *width = view->width;
+    uint8_t wide = view->wide;
+    run.columns = view->inputs;
+    for (uint8_t left = view->hidden + 1U; left != 0; left--, wide >>= 1) {
+        const uint8_t rows = left > 1 ? *width++ : view->outputs;
+        run.rows = even(rows);
+        run.kind = (uint8_t)((wide & SG_MLP_WIDE) | (left > 1 ? 0 : SG_MLP_OUTPUT));
         run.in = in;
         at = sg_mlp_layer(&run, at, out);
+        run.columns = rows;
         uint16_t *const swap = in;
         in = out;
         out = swap;

@@ -63,7 +63,9 @@ struct sg_mlp_head {
     uint8_t pad[7];             // zero
     struct sg_mlp_input input[8];
 };
+// cdef end
 
+// cdef begin
 // A validated network. The image is borrowed and must neither move nor change while the view is in use.
 struct sg_mlp_view {
     const uint8_t *image;
@@ -73,6 +75,8 @@ struct sg_mlp_view {
     uint8_t inputs;
     uint8_t outputs;
     uint8_t hidden;
+    uint8_t width[4];           // as stored
+    uint8_t wide;               // bit k: layer k has weights of 2 bytes
     uint8_t scratch_words;      // for sg_mlp_predict: 2 * (the largest layer rounded up to even), 4..128
     uint8_t reserved;
 };
@@ -114,7 +118,7 @@ int sg_mlp_open(struct sg_mlp_view *view, const uint8_t *image, uint32_t room, u
 //   own rounding: 64, 37 rms). The host states the sum of all that for a network (mlp.py) and
 //   tests/unit/test_mlp.py prints it beside the error measured.
 // Cost      the same number of cycles for every input. On AVR with the assembly 15 cycles per weight of
-//           1 byte, 22 of 2 bytes, 110 per row; tests/unit/test_mlp_avr.py.
+//           1 byte, 22 of 2 bytes, 120 per row, 250 per layer; tests/unit/test_mlp_avr.py.
 // Returns   SG_OK, or SG_E_RANGE if an output saturated (flags are set).
 int sg_mlp_predict(const struct sg_mlp_view *view, const uint16_t *input, uint16_t *scratch, int16_t *output,
                    uint8_t *flags);

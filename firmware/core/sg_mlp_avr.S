@@ -6,7 +6,7 @@
 
 #if defined(__AVR__) && !defined(SG_MLP_PORTABLE)
 
-#define z00 r2                  /* z of row 0, 24 bits; rows 1 to 3 in r5..r13 */
+/* z of rows 0 to 3: r2 r3 r4, r6 r7 r5, r8 r9 r10, r12 r13 r11; the two low bytes are a pair */
 #define al r14                  /* an activation; then the place in the image, saved */
 #define ah r15
 #define wl r16                  /* a weight; then a row's scale */
@@ -70,10 +70,11 @@
     sbc \z2, v2
 .endm
 
-.macro finish z0, z1, z2
-    mov v0, \z0
-    mov v1, \z1
+.macro finish load, z0, z1, z2
+    movw v0, \z0
     mov v2, \z2
+    \load wl, Z+
+    \load wh, Z+
     rcall finish_row
 .endm
 
@@ -96,37 +97,37 @@
 6:
     std Y+RUN_ROWS, wl
     begin \load, r2, r3, r4
-    begin \load, r5, r6, r7
+    begin \load, r6, r7, r5
     begin \load, r8, r9, r10
-    begin \load, r11, r12, r13
+    begin \load, r12, r13, r11
 2:
     ld al, X+
     ld ah, X+
     \multiply \load, r2, r3, r4
-    \multiply \load, r5, r6, r7
+    \multiply \load, r6, r7, r5
     \multiply \load, r8, r9, r10
-    \multiply \load, r11, r12, r13
+    \multiply \load, r12, r13, r11
     dec left
     brne 2b
-    finish r2, r3, r4
-    finish r5, r6, r7
-    finish r8, r9, r10
-    finish r11, r12, r13
+    finish \load, r2, r3, r4
+    finish \load, r6, r7, r5
+    finish \load, r8, r9, r10
+    finish \load, r12, r13, r11
     rjmp 1b
 3:
     cpi wl, -2
     brne 5f
     begin \load, r2, r3, r4
-    begin \load, r5, r6, r7
+    begin \load, r6, r7, r5
 4:
     ld al, X+
     ld ah, X+
     \multiply \load, r2, r3, r4
-    \multiply \load, r5, r6, r7
+    \multiply \load, r6, r7, r5
     dec left
     brne 4b
-    finish r2, r3, r4
-    finish r5, r6, r7
+    finish \load, r2, r3, r4
+    finish \load, r6, r7, r5
 5:
     rjmp layer_end
 .endm
@@ -168,6 +169,21 @@ sg_mlp_layer:
     clr v0
     clr v1
     clr v2
+    sbrc r16, WIDE
+    rjmp sum_wide
+1:
+    ld r0, X+
+    ld r1, X+
+    add v0, r0
+    adc v1, r1
+    adc v2, zero
+    dec left
+    brne 1b
+    lsr v2
+    ror v1
+    ror v0
+    rjmp 2f
+sum_wide:
     clr r2
     clr r3
 1:
@@ -183,8 +199,6 @@ sg_mlp_layer:
     lsr v2
     ror v1
     ror v0
-    sbrs r16, WIDE
-    rjmp 2f
     ror left                    ; left is 0
     mov v2, v1
     mov v1, v0
@@ -238,16 +252,8 @@ layer_end:
     pop r2
     ret
 
-; A row's z in v, its scale at Z, to one word at out; Z and out move on. Keeps r2..r13.
+; A row's z in v and its scale in w, to one word at out, which moves on. Keeps r2..r13 and Z.
 finish_row:
-    brts scale_from_flash
-    ld wl, Z+
-    ld wh, Z+
-    rjmp scale_known
-scale_from_flash:
-    lpm wl, Z+
-    lpm wh, Z+
-scale_known:
     movw al, r30
     mov sign, v2
     lsl sign

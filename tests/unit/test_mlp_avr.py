@@ -18,13 +18,13 @@ TWINS = {"assembly": (), "portable": ("SG_MLP_PORTABLE",)}
 SHAPES = {"6-16-2": ((16,), (2, 2)), "6-24-2": ((24,), (2, 2)), "6-16-16-2": ((16, 16), (2, 2, 2)),
           "6-16-16-2 with 1-byte weights inside": ((16, 16), (2, 1, 2)),
           "6-64x4-2 with 1-byte weights inside": ((64,) * 4, (2, 1, 1, 1, 2))}
-CYCLES = {("6-16-2", "assembly"): 6485, ("6-16-2", "portable"): 19403,
-          ("6-24-2", "assembly"): 9033, ("6-24-2", "portable"): 27787,
-          ("6-16-16-2", "assembly"): 14586, ("6-16-16-2", "portable"): 45616,
-          ("6-16-16-2 with 1-byte weights inside", "assembly"): 12787,
-          ("6-16-16-2 with 1-byte weights inside", "portable"): 40480,
-          ("6-64x4-2 with 1-byte weights inside", "assembly"): 230903,
-          ("6-64x4-2 with 1-byte weights inside", "portable"): 787130}
+CYCLES = {("6-16-2", "assembly"): 6303, ("6-16-2", "portable"): 19273,
+          ("6-24-2", "assembly"): 8827, ("6-24-2", "portable"): 27657,
+          ("6-16-16-2", "assembly"): 14281, ("6-16-16-2", "portable"): 45410,
+          ("6-16-16-2 with 1-byte weights inside", "assembly"): 12448,
+          ("6-16-16-2 with 1-byte weights inside", "portable"): 40274,
+          ("6-64x4-2 with 1-byte weights inside", "assembly"): 229386,
+          ("6-64x4-2 with 1-byte weights inside", "portable"): 786772}
 TOLERANCE = 0.03
 # What the notes of this project measured for a network of 16-bit integers in plain C.
 PLAIN_C = {"6-16-2": 15628, "6-24-2": 23010, "6-16-16-2": 40331}
@@ -93,7 +93,7 @@ def test_cycles_stack_and_constant_time(bench_dir, shape, twin):
     assert 0 < result.stack <= STACK_BYTES[twin]
     if twin == "assembly":
         assert 2.3 * high <= PLAIN_C.get(shape, np.inf)
-        assert 2.7 * high <= CYCLES[shape, "portable"]
+        assert 3.0 * high <= CYCLES[shape, "portable"]
 
 
 def test_no_float_no_division_no_heap_is_linked(bench_dir):
