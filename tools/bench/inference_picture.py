@@ -17,7 +17,7 @@ KINDS = {  # colour, words
     "sharp": (GOLD, "the same with a sharp ring"),
 }
 PEER_COLOURS = (("naive float", RED), ("emlearn", PLUM), ("m2cgen", GOLD), ("micromlgen", GREEN), ("", GREY))
-LABELS_MOST = 12
+LABEL_WIDTH, LABEL_HEIGHT, LABEL_SHIFTS = 4.0, 8.0, (-3, 6, -12, 15, -21)  # points
 
 
 def draw(path, report):
@@ -30,7 +30,7 @@ def draw(path, report):
     left, right = top.subplots(1, 2)
     _distance(left, report)
     _truth(right, report)
-    people, knowing, bars = bottom.subplots(1, 3, width_ratios=(1.0, 1.0, 1.25))
+    people, knowing, bars = bottom.subplots(1, 3, width_ratios=(1.0, 0.95, 1.35))
     for axis, key, panel in (
         (people, "frontier", _people),
         (knowing, "variance", _knowing),
@@ -108,12 +108,12 @@ def _cycles_axis(axis):
         axis.axvline(limit, color=GREY, ls=style, lw=1.2, zorder=1)
         axis.text(
             limit,
-            0.995,
-            f" {words} {limit:,}",
+            0.012,
+            f"{words}: {limit:,} ",
             rotation=90,
-            va="top",
+            va="bottom",
             ha="right",
-            fontsize=8,
+            fontsize=9,
             color=GREY,
             transform=axis.get_xaxis_transform(),
         )
@@ -147,7 +147,7 @@ def _distance(axis, report):
         ylabel="rms distance to the full float64 process (deg)",
     )
     axis.set_title("How close the device comes to the full process", color=INK)
-    axis.legend(fontsize=9, loc="upper right", bbox_to_anchor=(1.0, 0.97), framealpha=0.9)
+    axis.legend(fontsize=9, loc="upper right", framealpha=0.9)
 
 
 def _truth(axis, report):
@@ -186,11 +186,7 @@ def _truth(axis, report):
             mfc=colour if fits else "white",
             zorder=3,
         )
-        drawn.append((at, name, colour, kind))
-    for at, name, colour, kind in _spread(drawn):
-        axis.annotate(
-            name, at, textcoords="offset points", xytext=(7, -3), fontsize=7.5, color=colour, zorder=3
-        )
+        drawn.append((at, name, colour))
     axis.set_yscale("log")
     axis.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
     axis.yaxis.set_minor_formatter(NullFormatter())
@@ -198,21 +194,27 @@ def _truth(axis, report):
     peers_words = "squares: peers on persons, triangles: on smooth sets, hollow: do not fit" if peers else ""
     axis.set(xlabel="cycles a prediction", ylabel="mean error to where the eye really looked (deg)")
     axis.set_title("What it is worth" + (f"\n{peers_words}" if peers_words else ""), color=INK, fontsize=11)
-    axis.legend(fontsize=9, loc="upper right", bbox_to_anchor=(1.0, 0.97), framealpha=0.9)
+    axis.legend(fontsize=9, loc="upper right", framealpha=0.9)
+    if drawn:
+        axis.set_xlim(right=12 * max(at[0] for at, _, _ in drawn))  # room for names
+        axis.xaxis.set_major_locator(LogLocator(numticks=20))
+        _labelled(axis, drawn)
 
 
-def _spread(drawn):
-    """Points to label: those that do not lie on another label already, at most LABELS_MOST of each kind."""
-    kept = []
-    for point in sorted(drawn, key=lambda one: one[0][1]):
-        near = [
-            one
-            for one in kept
-            if abs(np.log(one[0][0] / point[0][0])) < 1.0 and abs(np.log(one[0][1] / point[0][1])) < 0.035
-        ]
-        if not near and sum(one[3] == point[3] for one in kept) < LABELS_MOST:
-            kept.append(point)
-    return kept
+def _labelled(axis, drawn):
+    """Write names beside points, (place, name, colour) each, moved up or down off one another."""
+    axis.figure.canvas.draw()
+    scale, taken = 72.0 / axis.figure.dpi, []  # points per pixel
+    boxes = [scale * axis.transData.transform(at) for at, _, _ in drawn]
+    for (at, name, colour), (x, y) in sorted(zip(drawn, boxes), key=lambda pair: tuple(pair[1])):
+        words = name.replace("naive float C", "naive float")[:46]
+        for shift in LABEL_SHIFTS:
+            box = (x + 7, y + shift, x + 7 + LABEL_WIDTH * len(words), y + shift + LABEL_HEIGHT)
+            if not any(box[0] < b[2] and b[0] < box[2] and box[1] < b[3] and b[1] < box[3] for b in taken):
+                place = dict(textcoords="offset points", xytext=(7, shift), fontsize=7.5)
+                axis.annotate(words, at, color=colour, zorder=3, **place)
+                taken.append(box)
+                break
 
 
 def _people(axis, report):
@@ -249,10 +251,10 @@ def _knowing(axis, report):
     known = report["variance"]
     names, values, wanted = [], [], []
     for key, words, goal in (
-        ("coverage68", "truth within 1 sigma", 0.6827),
-        ("coverage95", "truth within 1.96 sigma", 0.95),
-        ("gp64_coverage68", "the same, float64: 1 sigma", 0.6827),
-        ("gp64_coverage95", "1.96 sigma", 0.95),
+        ("coverage68", "device: truth within 1 sigma", 0.6827),
+        ("coverage95", "device: truth within 1.96", 0.95),
+        ("gp64_coverage68", "float64 process: within 1 sigma", 0.6827),
+        ("gp64_coverage95", "float64 process: within 1.96", 0.95),
         ("shut_flagged", "shut lids flagged", 1.0),
         ("half_flagged", "half-shut lids flagged", 1.0),
         ("narrow_flagged", "narrowed lids flagged", 1.0),
@@ -267,8 +269,15 @@ def _knowing(axis, report):
         y, values, color=[BLUE if "flagged" not in name else PLUM for name in names], height=0.62, alpha=0.85
     )
     axis.plot(wanted, y, "|", color=RED, ms=18, mew=2.2, label="as it should be")
-    for at, value in zip(y, values):
-        axis.text(max(value, 0.0) + 0.015, at, f"{100 * value:.1f} %", va="center", fontsize=9, color=INK)
+    for at, value, goal in zip(y, values, wanted):
+        axis.text(
+            goal + 0.02 if 0 <= goal - value < 0.1 else value + 0.015,
+            at,
+            f"{100 * value:.1f} %",
+            va="center",
+            fontsize=9,
+            color=INK,
+        )
     axis.set(yticks=y, xlim=(0, 1.15), xlabel="share of frames, mean of the persons")
     axis.set_yticklabels(names, fontsize=9)
     axis.set_title("Knowing when it does not know", color=INK)
@@ -280,15 +289,15 @@ def _bars(axis, report):
     axis.set_axis_off()
     rows = report["bars"]
     axis.set_title("Bars and aims", color=INK)
-    step = min(0.06, 1.0 / max(1, len(rows)))
+    step = min(0.075, 1.0 / max(1, len(rows)))
     for at, row in enumerate(rows):
         word = "met" if row["met"] else "MISSED" if row["kind"] == "bar" else "short"
         colour = {"met": GREEN, "MISSED": RED, "short": GOLD}[word]
         y = 1.0 - (at + 0.6) * step
         value = "none" if row["value"] is None else f"{row['value']:.4g}"
-        axis.text(0.0, y, word, color=colour, fontsize=8.5, fontweight="bold", transform=axis.transAxes)
-        axis.text(0.1, y, row["name"], color=INK, fontsize=8.5, transform=axis.transAxes)
-        axis.text(0.86, y, value, color=INK, fontsize=8.5, ha="right", transform=axis.transAxes)
+        axis.text(0.0, y, word, color=colour, fontsize=8.8, fontweight="bold", transform=axis.transAxes)
+        axis.text(0.105, y, row["name"], color=INK, fontsize=8.8, transform=axis.transAxes)
+        axis.text(0.86, y, value, color=INK, fontsize=8.8, ha="right", transform=axis.transAxes)
         axis.text(
-            0.88, y, f"{row['kind']} {row['limit']}", color=GREY, fontsize=8.5, transform=axis.transAxes
+            0.88, y, f"{row['kind']} {row['limit']}", color=GREY, fontsize=8.8, transform=axis.transAxes
         )
