@@ -15,7 +15,7 @@ from sparsegaze.model import DeviceModel
 from sparsegaze.wire import lib
 
 # Of what the host's core and the device both compute; changes only with the arithmetic itself.
-GOLDEN_CRC = {1: 0x8FC331C8, 64: 0x3292813A, 216: 0x9EE99F22}
+GOLDEN_CRC = {1: 0x0D7DA0D0, 64: 0x76A99246, 216: 0x97C657F8}
 
 
 def head_at(field):
