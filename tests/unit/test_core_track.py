@@ -15,16 +15,18 @@ BAD_FLAGS = lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_RECOVERING
 
 def plain(bias_deg_q7=(0, 0)):
     """One vector of weight 0: the gaze is the bias."""
-    return Parts(offset=np.full(6, 100), gain_q12=np.full(6, 4096), bias=np.array(bias_deg_q7) << 15,
+    return Parts(offset=np.full(6, 100), gain_q12=np.full(6, 4096), bias=np.array(bias_deg_q7) << 10,
                  trend=np.zeros((2, 6), int), centre=np.zeros((1, 6), int), weight=np.zeros((1, 2), int),
-                 weight_frac_bits=6)
+                 weight_frac_bits=5, sigma=np.full((2, 2), 120))
 
 
 def infer(view, feature, raw_flags=0, recentre=(0, 0), gain=(0, 0, 0, 0)):
     out, affine = ffi.new("struct sg_gaze *"), ffi.new("struct sg_affine *", (list(recentre), list(gain)))
     ffi.memmove(out, b"\xAA" * 12, 12)
     result = lib.sg_track_infer(view, [int(x) for x in feature], raw_flags, affine, out)
-    assert out.t_us == out.infer_us == out.sigma_log2_q4 == 0   # nothing of the old frame is left
+    assert out.t_us == out.infer_us == 0    # nothing of the old frame is left
+    unknown = view == ffi.NULL
+    assert out.sigma_log2_q4 == (0 if unknown else 255 if out.flags & lib.SG_FLAG_OUT_OF_RANGE else out.sigma_log2_q4)
     return result, (out.azimuth_deg_q7, out.elevation_deg_q7), out.flags
 
 
@@ -81,11 +83,12 @@ def test_batch_equals_single_frames_and_the_twin():
     recentre = ffi.new("struct sg_affine *", ([100, -50], [0] * 4))
     lib.sg_batch_infer(view.view, ffi.from_buffer("uint16_t[]", feature), ffi.from_buffer("uint8_t[]", raw),
                        recentre, out, 200)
-    deg, outside = twin(parts, feature)
+    deg, outside, _, sigma = twin(parts, feature)
     assert not scaled(parts, feature)[1].all()
     for i in range(200):
         single = infer(view.view, feature[i], int(raw[i]), (100, -50))
         assert single[1:] == ((out[i].azimuth_deg_q7, out[i].elevation_deg_q7), out[i].flags)
+        assert out[i].sigma_log2_q4 == (255 if out[i].flags & lib.SG_FLAG_OUT_OF_RANGE else sigma[i])
         expected = np.clip(np.clip(deg[i], -32768, 32767) + [100, -50], -32768, 32767)
         assert list(single[1]) == list(expected)
         assert bool(single[2] & lib.SG_FLAG_VALID) == (
