@@ -28,7 +28,8 @@ SVR_WIDEST_DEG, SVR_HALVINGS = 8.0, 7
 SVR_EXPORTED = 300  # of one output: m2cgen recurses for each vector, up to Python's limit
 SVR_VECTORS_FIT = 72  # of both outputs: at 400 bytes of code each, what 30 KB hold
 NETWORKS = (((16,), "tanh"), ((16,), "relu"), ((16, 16), "tanh"), ((16, 16), "relu"))
-MLP_ROWS, MLP_SEEDS, MLP_STEPS = 1000, 3, 1000
+MLP_ROWS, MLP_SEEDS = 1000, 3
+MLP_WORK, MLP_STEPS = 2e6, (500, 5000)  # samples times steps; least and most steps
 MLP_DECAYS = (5e-5, 2e-6, 5e-4)
 FORESTS = ((1, 40), (1, 120), (1, 300), (3, 110), (6, 55), (10, 32))  # trees, leaves: what 30 KB hold
 WRAPPED = """#include "peer.h"
@@ -104,13 +105,14 @@ def emlearn_networks(calibration, held_out):
     c, made = calibration, []
 
     def network(x, y, layers, kind, decay, seed):
+        steps = int(np.clip(MLP_WORK / len(x), *MLP_STEPS))
         return MLPRegressor(
             hidden_layer_sizes=layers,
             activation=kind,
             alpha=decay * len(x),  # scikit-learn divides it by the number of samples
             solver="lbfgs",
-            max_iter=MLP_STEPS,
-            max_fun=10 * MLP_STEPS,
+            max_iter=steps,
+            max_fun=10 * steps,
             tol=1e-9,
             random_state=seed,
         ).fit(c.standard(x), (y - c.middle_deg) / c.level_deg)
