@@ -329,7 +329,7 @@ class Canberra(Kernel):
 
     def natural(self, x):
         few = _few(x)
-        unit = np.sqrt([np.mean(term**2) for term in self.terms(few, few)])
+        unit = np.sqrt([np.mean(term**2) or 1.0 for term in self.terms(few, few)])
         return x, unit, unit
 
     def term(self, a, b):
@@ -368,7 +368,7 @@ class Cosine(Kernel):
 
     def natural(self, x):
         few = self.coordinates(_few(x))
-        unit = np.sqrt([np.mean(next(self.terms(few, few)))])
+        unit = np.sqrt([np.mean(next(self.terms(few, few))) or 1.0])
         return x, unit, unit
 
     def terms(self, a, b):

@@ -43,7 +43,7 @@ class Samples:
         if max(np.abs(x).max(initial=0.0), np.abs(y).max(initial=0.0)) > LARGEST:
             raise CalibrationError("features or targets are larger than 1e100", "mark those rows valid = 0")
         kernel.check(x)
-        varying = np.ptp(x, axis=0) > 0 if n else np.zeros(x.shape[1], bool)
+        varying = (np.ptp(x, axis=0) > 0) & (x.std(axis=0) > 0) if n else np.zeros(x.shape[1], bool)
         columns = mean_columns(mean, int(varying.sum()))
         if n < columns + 2:
             raise CalibrationError(

@@ -305,3 +305,25 @@ def test_order_and_threads_do_not_change_a_bit_whatever_the_kernel(tmp_path):
         command = [sys.executable, "-c", script, seed]
         answers.append(subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout)
     assert answers[0] == answers[1] and len(answers[0]) > 10_000
+
+
+@every_kernel
+def test_one_live_channel_and_channels_that_hardly_change(name, p):
+    """One channel, all others dead: whatever the kernel can do with it, without a word of numpy's."""
+    features, gaze = recording(40)
+    alone = np.full((40, 6), 65535.0)
+    alone[:, 3] = features[:, 3]
+    gp = quietly(alone, gaze, mean="constant", kernel=name, p=p, restarts=0)
+    assert gp.dropped == (0, 1, 2, 4, 5) and np.abs(gp.predict(alone)).max() < 40
+    rare = features.copy()
+    rare[:, 1] = 500.0
+    rare[7, 1] = 501.0
+    gp = quietly(rare, gaze, mean="constant", kernel=name, p=p, restarts=0)
+    assert gp.dropped == () and gp.rounding_deg < 0.01 and gp.describe()["loo_rms_deg"] < 10
+
+
+def test_a_channel_whose_changes_float64_cannot_square_is_as_good_as_constant():
+    features, gaze = recording(30)
+    features[:, 2] = 1e-200 * features[:, 2]
+    with pytest.warns(UserWarning, match="constant channel dropped: s2"):
+        GaussianProcess.fit(features, gaze, mean="constant", restarts=0)
