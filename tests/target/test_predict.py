@@ -200,6 +200,7 @@ def test_a_record_with_a_part_missing_is_refused(tmp_path):
         device.infer(random_features(3))
         assert len(board.sections()[REQUEST_SECTION]) >= 3
         whole = board._scope.read_bytes()
+        assert [len(k) for k in qemu.section_counts(whole[:-3]).values()] == [len(whole) // 8 - 2, 1]
         board._scope.write_bytes(whole[:8] + whole[16:])
         with pytest.raises(ProtocolError, match="damaged"):
             board.sections()
