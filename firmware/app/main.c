@@ -9,8 +9,8 @@ enum {
     // Stream frames leave this much of the send queue to answers.
     REPLY_RESERVE = SG_WIRE_FRAME_MAX,
     // A blink leaves the calibrated range before the lids are where they were: this long after the last frame
-    // out of range a gaze may look right and be wrong. 108 ms at 3.84 ms.
-    RECOVERY_FRAMES = 28,
+    // out of range a gaze may look right and be wrong. 31 ms at 3.84 ms.
+    RECOVERY_FRAMES = 8,
 };
 
 struct app_state app;
