@@ -150,7 +150,7 @@ def core_objects():
     return [compile_one(source, folder) for source in sources]
 
 
-def run_cases(directory, body, inputs, out_bytes, includes=(), setup="", data=None, wrap=None):
+def run_cases(directory, body, inputs, out_bytes, includes=(), setup="", data=None, wrap=None, altered=None):
     """Compile and run `body` once per row of inputs.
 
     body      C statements; `in` points to the row's bytes (8-aligned), `out` to out_bytes zeroed bytes
@@ -158,8 +158,9 @@ def run_cases(directory, body, inputs, out_bytes, includes=(), setup="", data=No
     setup     C statements before the first case: declare what the body needs
     data      {name: bytes}, constant arrays of that name that setup and body may read (8-aligned)
     wrap      name of a function of the core that is called from another file
+    altered   path of a C file to take instead of the core's file of that name
     """
-    elf = build(directory, body, inputs, out_bytes, includes, setup, data, wrap)
+    elf = build(directory, body, inputs, out_bytes, includes, setup, data, wrap, altered)
     output, counts = run_elf(elf)
     assert len(output) == len(inputs) * out_bytes, f"the program wrote {len(output)} bytes"
     function = None
@@ -171,7 +172,7 @@ def run_cases(directory, body, inputs, out_bytes, includes=(), setup="", data=No
                   function, elf)
 
 
-def build(directory, body, inputs, out_bytes, includes=(), setup="", data=None, wrap=None):
+def build(directory, body, inputs, out_bytes, includes=(), setup="", data=None, wrap=None, altered=None):
     """The program of run_cases, not run; returns its path."""
     directory = pathlib.Path(directory)
     inputs = np.ascontiguousarray(inputs)
@@ -195,8 +196,13 @@ def build(directory, body, inputs, out_bytes, includes=(), setup="", data=None, 
         flags.append(f"-Wl,--wrap={wrap}")
     (directory / "case_wrap.s").write_text(WRAP.format(marked="".join(marked)), encoding="utf-8")
     own = [compile_one(directory / name, directory, [directory]) for name in ("case_main.c", "case_wrap.s")]
+    core = {made.name: made for made in core_objects()}
+    if altered:
+        made = compile_one(altered, directory)
+        assert made.name in core, f"the core has no file of the name of {altered}"
+        core[made.name] = made
     elf = directory / "case.elf"
-    run([tool("gcc"), *FLAGS, *flags, *core_objects(), *own, "-o", elf])
+    run([tool("gcc"), *FLAGS, *flags, *core.values(), *own, "-o", elf])
     return elf
 
 

@@ -13,16 +13,17 @@ from sparsegaze.device import Device
 from sparsegaze.errors import NoDeviceError
 from test_core_avr import READINGS, gaze_bytes
 from test_core_gp import GOLDEN_CRC, golden_case
+from test_core_negative import FAULTS
 
 INFER = "sg_track_infer(&view, (const uint16_t *)in, 0, &recentre, (struct sg_gaze *)out);"
 OPEN = ("struct sg_model_view view; const struct sg_affine recentre = { 0 };"
         "if (sg_model_open(&view, image, sizeof image, 0) != SG_OK) return 1;")
 
 
-def infer(directory, parts, feature, wrap=None):
+def infer(directory, parts, feature, **more):
     """sg_track_infer over the features on the Cortex-M4."""
     return m4.run_cases(directory, INFER, feature, ffi.sizeof("struct sg_gaze"), ["sg_track.h", "sg_err.h"],
-                        OPEN, {"image": parts.image()}, wrap)
+                        OPEN, {"image": parts.image()}, **more)
 
 
 def test_golden_vectors_are_bit_identical(tmp_path):
@@ -71,11 +72,16 @@ def test_a_wrapped_function_is_counted_without_its_caller(tmp_path):
     assert 1 <= result.function[0] < 10 and (np.diff(result.function) > 0).all()
 
 
-def test_a_wrong_instruction_in_the_core_would_be_seen(tmp_path):
+@pytest.mark.parametrize("fault", ["the sign of a weight", "one table entry", "one guard left out"])
+def test_a_broken_core_turns_the_golden_vectors_red(fault, tmp_path):
+    name, right, wrong = FAULTS[fault]
+    (tmp_path / "altered").mkdir()
+    text = (m4.CORE / name).read_text(encoding="utf-8")
+    assert text.count(right) == 1
+    (tmp_path / "altered" / name).write_text(text.replace(right, wrong), encoding="utf-8")
     parts, feature = golden_case()
-    wrong = m4.run_cases(tmp_path, INFER + " out[4] ^= i == 63;", feature, 12, ["sg_track.h", "sg_err.h"],
-                         OPEN, {"image": parts.image()})
-    assert zlib.crc32(wrong.output.tobytes()) != GOLDEN_CRC
+    broken = infer(tmp_path, parts, feature, altered=tmp_path / "altered" / name)
+    assert zlib.crc32(broken.output.tobytes()) != GOLDEN_CRC
 
 
 def test_a_program_that_floods_the_line_is_no_device(tmp_path):
