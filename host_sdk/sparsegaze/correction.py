@@ -14,10 +14,10 @@ import numpy as np
 
 from .wire import GAIN_STEPS_MAX
 
-# What a fixation's mean is off, a person's own bias and the model's local error together, and what a slip of
-# a millimetre does to the gain: rms over simulated persons, tools/bench/recentre_slip.py.
-POINT_SIGMA_DEG = 0.7
-GAIN_SIGMA = 0.05
+# What a fixation is off in each axis, a person's own bias and the bend of the slip together, and what a slip of
+# half a millimetre makes of the gain: rms on simulated persons, tools/bench/recentre_slip.py.
+POINT_SIGMA_DEG = 0.8
+GAIN_SIGMA = 0.1
 POINTS_LEAST, POINTS_MOST = 3, 9
 GAIN_STEP = 1 / 512
 GAIN_LIMIT = GAIN_STEPS_MAX * GAIN_STEP
