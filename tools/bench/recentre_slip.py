@@ -49,12 +49,14 @@ def map_of(seed, slip_mm):
 
 
 def judge(port, seed):
-    """{mean_deg, loss_percent} of the gaze on the held-out targets."""
-    report = validate.run(port, HELD_OUT, seed).report()
-    if not report["stream"]["bit_identical"]:
+    """{mean_deg, loss_percent, per_target (target and mean gaze, deg)} of the gaze on the held-out targets."""
+    done = validate.run(port, HELD_OUT, seed)
+    if not done.bit_identical:
         raise SparsegazeError("host and device differ", "this is a bug")
-    found = report["accuracy"]
-    return {"mean_deg": found["mean_deg"], "loss_percent": found["data_loss_percent"]}
+    found = done.report()["accuracy"]
+    targets = [[row[name] for name in ("target_az_deg", "target_el_deg", "gaze_az_deg", "gaze_el_deg")]
+               for row in done.per_target()]
+    return {"mean_deg": found["mean_deg"], "loss_percent": found["data_loss_percent"], "per_target": targets}
 
 
 def corrected(port, seed, n_points):
@@ -73,8 +75,7 @@ def corrected(port, seed, n_points):
 
 
 def of_person(seed, slips_mm, n_points, say):
-    """Rows {person, slip_mm, before, after_1, after_N} of one person; slip 0 is the calibrated seat."""
-    rows = []
+    """Tells rows {person, slip_mm, before, after_1, after_N} of one person; slip 0 is the calibrated seat."""
     with tempfile.TemporaryDirectory(prefix="sgr-") as folder:
         options = {"unpaced": True, "app": FIRMWARE, "state_dir": Path(folder) / "nano"}
         for size in (0.0, *slips_mm):
@@ -87,9 +88,7 @@ def of_person(seed, slips_mm, n_points, say):
                     row[f"after_{n}"] = corrected(nano.port, seed, n)
                 with Device(nano.port) as device:
                     recentre.keep(device)
-            rows.append(row)
-            say(line(row))
-    return rows
+            say(row)
 
 
 def line(row):
@@ -112,9 +111,18 @@ def main():
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "bench" / "recentre.json")
     chosen = parser.parse_args()
     rows = []
+
+    def say(row):
+        rows.append(row)
+        print(line(row), flush=True)
+        part = chosen.out.with_name(f"{chosen.out.name}.{os.getpid()}.part")
+        part.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        part.replace(chosen.out)
+
+    chosen.out.parent.mkdir(parents=True, exist_ok=True)
     try:
         for seed in range(chosen.first, chosen.first + chosen.persons):
-            rows += of_person(seed, chosen.slips, chosen.points, lambda text: print(text, flush=True))
+            of_person(seed, chosen.slips, chosen.points, say)
     except SparsegazeError as error:
         print(f"recentre_slip: {error}", file=sys.stderr)
         return 1
@@ -123,10 +131,6 @@ def main():
         means = [f"{name} {np.nanmean([row[name]['mean_deg'] for row in of_size]):.2f}"
                  for name in of_size[0] if name not in ("person", "slip_mm", "direction")]
         print(f"slip {size:.1f} mm, mean over {len(of_size)} simulated persons, deg: " + ", ".join(means))
-    chosen.out.parent.mkdir(parents=True, exist_ok=True)
-    part = chosen.out.with_name(f"{chosen.out.name}.{os.getpid()}.part")
-    part.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-    part.replace(chosen.out)
     return 0
 
 
