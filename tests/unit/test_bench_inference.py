@@ -165,7 +165,7 @@ def good_report():
         "peers": [peer],
         "host": {"samples": 2000, "cpu_fit_s": 5.0, "cpu_distil_s": 5.0, "predictions_per_second": 2e6},
         "identity": {"targets": ["host", "nano", "cortex-m4"], "crc": ["A", "A", "A"]},
-        "hard": [{"name": "x", "outcome": "passed"}],
+        "hard": [{"name": f"x{i}[y]", "outcome": "passed"} for i in range(16)],
     }
 
 
@@ -192,6 +192,7 @@ SPOILT = {
     "predictions a second and core, host": lambda r: r["host"].update(predictions_per_second=9e5),
     "of host, nano, cortex-m4: same bits": lambda r: r["identity"]["targets"].pop(),
     "different answers among all targets": lambda r: r["identity"]["crc"].__setitem__(2, "B"),
+    "hard cases, parameters aside": lambda r: r["hard"][0].update(name="x1[z]"),
     "hard cases that behave as expected, share": lambda r: r["hard"][0].update(outcome="skipped"),
 }
 

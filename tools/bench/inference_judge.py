@@ -15,6 +15,7 @@ CYCLES_BAR, CYCLES_AIM = 11_000, 7_000
 RATIO_BAR, RMS_BAR_DEG, RMS_AIM_DEG, SMOOTH_BAR_DEG = 1.05, 0.15, 0.05, 0.02
 PERSONS_BAR, MAP_BAR = 20, 1e-4
 PORTABLE_BAR = 40_000  # cycles of the portable loop at 64 vectors
+HARD_BAR = 16  # kinds of hard cases that are asked for
 FIT_BAR_S, PREDICTIONS_BAR, NAIVE_AIM = 20.0, 1e6, 40.0
 EQUAL = 1.005  # errors that differ by half a percent are equal: what 2000 rows can tell
 TARGETS = ("host", "nano", "cortex-m4")
@@ -269,6 +270,8 @@ def bars(report):
         at_least(f"of {', '.join(TARGETS)}: same bits", len(same), len(TARGETS))
         at_most("different answers among all targets", len(set(crc.values())), 1)
     if "hard" in report:
+        kinds = {row["name"].split("[")[0] for row in report["hard"]}
+        at_least("hard cases, parameters aside", len(kinds), HARD_BAR)
         passed = [row["outcome"] == "passed" for row in report["hard"]]
         at_least("hard cases that behave as expected, share", float(np.mean(passed)) if passed else None, 1)
     return rows
