@@ -8,6 +8,7 @@ import pytest
 from mlp_models import synthetic_set
 from sparsegaze import mlp, mlp_round, mlp_train
 from sparsegaze.errors import CalibrationError
+from sparsegaze.gp import GaussianProcess
 from sparsegaze.mlp import MlpModel
 
 
@@ -28,7 +29,7 @@ def rms(a, b):
     return float(np.sqrt(np.mean(np.sum((a - b) ** 2, axis=1))))
 
 
-@pytest.mark.parametrize("weight_bytes,limit", [(2, 0.006), ("auto", 0.025), (1, 0.08)])
+@pytest.mark.parametrize("weight_bytes,limit", [(2, 0.008), ("auto", 0.025), (1, 0.08)])
 def test_fixed_point_stays_close_to_the_float_network(trained, weight_bytes, limit):
     features, network, test, truth = trained
     model, report = mlp_round.quantise(network, features, weight_bytes)
@@ -39,6 +40,23 @@ def test_fixed_point_stays_close_to_the_float_network(trained, weight_bytes, lim
           f"error to the truth {error:.4f}, of the float network {float_error:.4f} deg")
     assert rms(y, exact) < limit and error < (1.0 + limit) * float_error
     assert report.n_bytes == len(model.image) and report.weight_bytes == model.weight_bytes
+
+
+@pytest.mark.parametrize("widths", [(16,), (24,), (16, 16), (12, 8)], ids=str)
+def test_small_networks_distilled_from_a_process(widths):
+    features, gaze, test, truth = synthetic_set(0)
+    gp = GaussianProcess.fit(features, gaze, mean="constant")
+    network = mlp_train.distil(gp, features, gaze, widths, points=1500, noise=1.5, restarts=1, steps=1500)
+    full, exact = gp.predict(test.astype(float)), network.predict(test)
+    for weight_bytes, limit in ((2, 0.008), ("auto", 0.025)):
+        model, report = mlp_round.quantise(network, features, weight_bytes)
+        y = outputs(model, test)
+        error, full_error = (np.hypot(*(v - truth).T).mean() for v in (y, full))
+        print(f"6-{'-'.join(map(str, widths))}-2, weights of {report.weight_bytes} bytes, {report.n_bytes} "
+              f"bytes: rms to the process {rms(y, full):.3f} (float {rms(exact, full):.3f}), to the float "
+              f"network {rms(y, exact):.4f}; mean error to the truth {error:.3f} deg (process {full_error:.3f})")
+        assert rms(y, exact) < limit and rms(y, full) < 1.05 * rms(exact, full) + limit
+    assert rms(exact, full) < 0.4
 
 
 @pytest.mark.parametrize("weight_bytes", [1, 2])
