@@ -2,25 +2,24 @@
 """From a float64 Gaussian process to the few integer vectors that an 8-bit device can carry.
 
 The device's mean is  bias + trend . s + sum_i w_i k(s, c_i)  (firmware/core/sg_model.h). Everything in it is
-fitted to the process's mean over a cloud of likely inputs: the centres by variable projection and L-BFGS,
-rounded in stages; then trend, weights and bias, one after the other, on the integer kernel values of the
-device itself, so that the rounding of each is made good by those still free. DESIGN.md section 5; notes on
-what each step buys stand beside it.
+fitted to the process's mean over a cloud of likely inputs: gains and centres in real numbers (expansion.py), then
+rounded in stages; then trend, weights and bias, one after the other, on the integer kernel values of the device
+itself, so that the rounding of each is made good by those still free (rounding.py). The process may have any
+kernel; the device's is always the RBF. DESIGN.md section 5; notes on what each step buys stand beside it.
 """
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 
+from . import choose
 from .errors import CalibrationError, ModelError
-from .fixations import TARGETS_NEEDED, fixations
+from .expansion import Problem, pruned, spread_start
 from .gp import GaussianProcess
-from .model import CHANNELS, S_FRAC, S_MAX, U_STEPS, VECTORS_MAX, DeviceModel, emulate, quantise
-from .rounding import assemble
+from .model import CHANNELS, VECTORS_MAX, DeviceModel, emulate, quantise
+from .process import fit_process
+from .rounding import BOX, CENTRE_TOP, GAIN_MAX, LENGTH_STEPS, assemble, error_bound_deg, integer_box, integer_centres
 from .trust import GUARDS, Trust
 
 BOX_MARGIN = 0.12  # of a channel's calibrated range, on each side
@@ -28,18 +27,14 @@ BOX_SIGMAS = 6.0  # and at least this many frame-noise deviations
 GUARD_MARGIN = 0.06
 GUARD_SIGMAS = 5.0
 TAIL = 5e-4  # quantile taken for the end of the calibrated range
-RIDGES = [1e-8 * 3**i for i in range(12)]  # of a squared kernel value; the first that fits is taken
-POINTS = 6000
+RIDGES = [1e-8 * 10**i for i in range(7)]  # of a squared kernel value; the first that fits is taken
+POINTS = 4500  # that are fitted to; a third as many are held out
+POOL = 2000  # of them, where centres may begin
 NEIGHBOURS, MIXED, BEYOND = 8, 0.7, 0.5
-ROUNDING = (0.5, 0.75, 0.9, 1.0)
-MEAN = "constant"
-FRAMES_EACH = 16  # frames of each fixation that the process is given, noise and all
-LENGTH_MAX = 3.0  # standard deviations of a channel: longer ones only ask for huge weights
-ROWS_MAX, LEARN_MAX = 2000, 400  # rows of the final process, and of the one whose likelihood is maximised
-CLOUD_EACH = 50
-OUTLIER_SIGMAS, OUTLIER_ROUNDS = 6.0, 3
-FIRST_STEPS, LATER_STEPS = 1500, 60
-LOO_DOUBTFUL_DEG = 3.0  # twice what people reach with such a headset; gaze at random has about 18
+GAIN_START, GAIN_LEAST = 0.75, 0.1  # of the gain that fills the range of the kernel's inputs
+SURPLUS, LARGEST = 1.5, 160  # centres to begin with, of those wanted; at most
+SEARCH_FROM = 96  # centres at the beginning of the search for the fewest; more when these do not do
+FIRST_STEPS, LATER_STEPS, POLISH_STEPS = 15, 6, 40
 
 
 @dataclass(frozen=True)
@@ -49,7 +44,7 @@ class DistilReport:
     rms_deg, max_deg   distance over held-out likely inputs, by the device's integer arithmetic
     out_of_range       share of those inputs that its guards refuse
     n_vectors, weight_frac_bits, weight_range_deg (least, largest), reach_deg (proven bound of |gaze| before
-    wrapping, and what the accumulator holds), points (used to fit)
+    wrapping, and what the accumulator holds), error_bound_deg (rounding.py), points (used to fit)
     """
 
     rms_deg: float
@@ -59,76 +54,166 @@ class DistilReport:
     weight_frac_bits: int
     weight_range_deg: tuple
     reach_deg: tuple
+    error_bound_deg: float
     points: int
 
 
-def distil(gp, features, gaze_deg, n_vectors=64, seed=0, noise=None, points=None):
+def distil(gp, features, gaze_deg, n_vectors=64, seed=0, noise=None, points=None, aim_deg=None, say=None):
     """Make a DeviceModel from a fitted GaussianProcess.
 
     features    [n, d] frames of the calibration, blinks excluded: their cloud is the range of the model
     gaze_deg    [n, 2] where those frames were looking (used to find neighbours, not as labels)
+    n_vectors   how many; with aim_deg at most so many, and the fewest whose rms distance is within aim_deg
     noise       [d] rms of one frame, feature units; default 0;  points: number of inputs to fit to
+    say(part)   is called with the share of the work that is done
     Returns (DeviceModel, DistilReport); a pure function of its arguments. Raises CalibrationError or
     ModelError.
     """
     features, gaze = np.asarray(features, float), np.asarray(gaze_deg, float)
-    points = points or POINTS
     if not 1 <= n_vectors <= VECTORS_MAX:
         raise ModelError(f"{n_vectors} vectors do not fit the device", f"ask for 1 to {VECTORS_MAX}")
     if len(features) < 2 or features.shape[1] > CHANNELS:
         few = f"{len(features)} samples of {features.shape[1:]} channels do not do"
         raise CalibrationError(few, f"give at least 2 samples of at most {CHANNELS} channels")
-    rng = np.random.default_rng([0x647374, seed])
     order = np.lexsort(np.column_stack([features, gaze]).T)  # the order of the samples must not matter
-    features, gaze = features[order], gaze[order]
     noise = np.zeros(features.shape[1]) if noise is None else np.asarray(noise, float)
-    offset, gain = box(gp, features, noise)
-    cloud = likely_inputs(rng, features, gaze, noise, points + points // 3)
-    s, clamped = quantise(np.clip(np.rint(cloud), 0, 65535), offset, gain)
-    s, cloud = s[~clamped], cloud[~clamped]
-    # The process is asked at the very inputs that the device sees, quantised.
-    target = gp.predict(unquantise(s, offset, gain, cloud))
-    held = np.arange(len(s)) % 4 == 3
-    n_vectors = min(n_vectors, max(1, int((~held).sum()) // 4))
-    rails = guards(features, offset, gain, noise)
-    centres = None
-    for ridge in RIDGES:
-        centres = optimise_centres(rng, s[~held], target[~held], n_vectors, gain > 0, ridge, centres)
-        made = assemble(s[~held], target[~held], centres, offset, gain, rails, ridge)
-        if made:
-            break
-    else:
+    task = _Task(gp, features[order], gaze[order], noise, points or POINTS, seed)
+    with threadpool_limits(limits=1, user_api="blas"):  # small matrices; and the sums' order is the answer's
+        return task.run(min(n_vectors, max(1, len(task.train) // 4)), aim_deg, say or (lambda part: None))
+
+
+class _Task:
+    """The cloud, in the box; and what is done with it."""
+
+    def __init__(self, gp, features, gaze, noise, points, seed):
+        self.gp, self.features, self.noise = gp, features, noise
+        self.live = np.flatnonzero(np.isfinite(gp.hyper.length))
+        low, high = box(features, noise)
+        self.middle, self.width = (0.5 * (low + high))[self.live], (high - low)[self.live]
+        rng = np.random.default_rng([0x647374, seed])
+        cloud = likely_inputs(rng, features, gaze, noise, points + points // 3)
+        inside = ((cloud >= low) & (cloud <= high))[:, self.live].all(axis=1)
+        cloud = np.clip(np.rint(cloud[inside]), 0, 65535)
+        held = np.arange(len(cloud)) % 4 == 3
+        self.train, self.held = cloud[~held], cloud[held]
+
+    def run(self, n_vectors, aim_deg, say):
+        problem = self._problem(RIDGES[0])
+        if aim_deg is None:
+            found = list(self._path(problem, n_vectors, n_vectors, say))[-1:]
+        else:
+            found = self._search(problem, n_vectors, aim_deg, say)
+        for i, expansion in enumerate(reversed(found)):
+            say(0.8 + 0.2 * i / len(found))
+            model, reach_deg = self._integers(expansion.improved(POLISH_STEPS))
+            miss, refused = self._judge(model)
+            if aim_deg is None or np.sqrt(np.mean(miss**2)) <= aim_deg:
+                break
+        weights = model.weights / 2.0**model.weight_frac_bits
+        return model, DistilReport(
+            float(np.sqrt(np.mean(miss**2))),
+            float(miss.max()),
+            float(np.mean(refused)),
+            model.vectors,
+            model.weight_frac_bits,
+            (float(weights.min()), float(weights.max())),
+            reach_deg,
+            error_bound_deg(model),
+            len(self.train),
+        )
+
+    def _problem(self, ridge):
+        z = (self.train[:, self.live] - self.middle) / self.width
+        most = np.minimum(BOX, GAIN_MAX * self.width / LENGTH_STEPS / 4096.0)
+        return Problem(
+            z,
+            self.gp.predict(self.train),
+            ridge,
+            np.stack([GAIN_LEAST * most, most]),
+            -self.middle / self.width,
+            CENTRE_TOP,
+        )
+
+    def _path(self, problem, most, least, say):
+        """Expansions of at most `most` centres, fewer and fewer."""
+        count = min(max(most, LARGEST), int(np.ceil(SURPLUS * most)), max(most, len(self.train) // 4))
+        first = spread_start(problem, count, GAIN_START * problem.gain_range[1], problem.z[:POOL])
+        for expansion in pruned(first.improved(FIRST_STEPS), most, LATER_STEPS):
+            say(0.8 * (1.0 - (len(expansion.centres) - least) / max(count - least, 1)))
+        yield expansion
+        for expansion in pruned(expansion, least, LATER_STEPS):
+            say(0.8 * (1.0 - (len(expansion.centres) - least) / max(count - least, 1)))
+            yield expansion
+
+    def _search(self, problem, most, aim_deg, say):
+        """Expansions to try, the last one first: fewer and fewer centres while the aim is met."""
+        found = []
+        for size in sorted({min(most, int(SEARCH_FROM / SURPLUS)), most}):
+            for expansion in self._path(problem, size, 1, say):
+                if expansion.rms > aim_deg:
+                    expansion = expansion.improved(POLISH_STEPS)
+                if expansion.rms > aim_deg:
+                    break
+                found.append(expansion)
+            if found:
+                return found
+        return [expansion]
+
+    def _integers(self, expansion):
+        for ridge in RIDGES:
+            if ridge != expansion.problem.ridge:
+                problem = self._problem(ridge)
+                expansion = type(expansion)(problem, expansion.gains, expansion.centres).improved(POLISH_STEPS)
+            offset, gain_q12, centres = self._placed(expansion)
+            s, target = self._steps(self.train, offset, gain_q12)
+
+            def trust_of(model):
+                return guards(self.features, offset, gain_q12, self.noise)
+
+            made = assemble(s, target, centres, offset, gain_q12, ridge, trust_of)
+            if made:
+                return made
         none = "no number format holds the weights of this model"
         raise CalibrationError(none, "calibrate again with more targets")
-    model, bound_deg = made
-    fitted = np.clip(np.rint(cloud[held]), 0, 65535).astype(np.uint16)
-    az, el, flags = emulate(model, fitted)
-    miss = np.hypot(az / 128.0 - target[held, 0], el / 128.0 - target[held, 1])
-    weights = model.weights / 2.0**model.weight_frac_bits
-    rms_deg, max_deg = float(np.sqrt(np.mean(miss**2))), float(miss.max())
-    refused = float(np.mean(flags & 4 != 0))
-    span = float(weights.min()), float(weights.max())
-    fitted_to = int((~held).sum())
-    return model, DistilReport(
-        rms_deg, max_deg, refused, model.vectors, model.weight_frac_bits, span, bound_deg, fitted_to
-    )
+
+    def _placed(self, expansion):
+        """offset, gain_q12 [d], centres [n, d] of all channels; zeros where the process dropped one."""
+        d = self.features.shape[1]
+        offset, gain_q12 = np.zeros(d, np.int64), np.zeros(d, np.int64)
+        offset[self.live], gain_q12[self.live] = integer_box(expansion.gains, self.middle, self.width)
+        s, target = self._steps(self.train, offset, gain_q12)
+        centres = np.zeros((len(expansion.centres), d), np.int64)
+        centres[:, self.live] = integer_centres(
+            expansion,
+            s[:, self.live],
+            target,
+            offset[self.live],
+            gain_q12[self.live],
+            self.middle,
+            self.width,
+        )
+        return offset, gain_q12, centres
+
+    def _steps(self, cloud, offset, gain_q12):
+        """(s, what the process says there). It is asked at the very inputs that the device sees, quantised."""
+        s, _ = quantise(cloud, offset, gain_q12)
+        return s, self.gp.predict(unquantise(s, offset, gain_q12, cloud))
+
+    def _judge(self, model):
+        """(distance in degrees, refused) of the held-out inputs, by the device's integer arithmetic."""
+        az, el, flags = emulate(model, self.held.astype(np.uint16))
+        target = self.gp.predict(self.held)
+        return np.hypot(az / 128.0 - target[:, 0], el / 128.0 - target[:, 1]), flags & 4 != 0
 
 
-def box(gp, features, noise):
-    """Offset and gain of every channel: (offset int64 [d], gain_q12 int64 [d]).
+def box(features, noise):
+    """Least and largest feature of every channel that the model is made for, float [d] each.
 
-    The box holds the calibrated range and a margin, so that ordinary gaze never clips, and no more than that:
-    the device's length scale is a fixed part of the box, and the shorter it is, the smaller are the weights
-    that a steep direction needs. Gains by the process's length scales gave weights 4 times larger at equal
-    error on simulated eyes, whose channels are alike and differ where it matters. Channels that the process
-    dropped have gain 0.
+    The calibrated range and a margin, so that ordinary gaze never clips.
     """
     low, high = np.quantile(features, [TAIL, 1 - TAIL], axis=0)
     margin = np.maximum(BOX_MARGIN * (high - low), BOX_SIGMAS * noise) + 2
-    low, high = np.maximum(low - margin, 0), np.minimum(high + margin, 65535)
-    gain_q12 = np.minimum(np.floor(4096 * S_MAX / (high - low)), 65535).astype(np.int64)
-    gain_q12[~np.isfinite(gp.hyper.length)] = 0
-    return np.where(gain_q12 > 0, np.floor(low), 0).astype(np.int64), gain_q12
+    return np.maximum(low - margin, 0.0), np.minimum(high + margin, 65535.0)
 
 
 def unquantise(s, offset, gain_q12, like):
@@ -161,82 +246,6 @@ def likely_inputs(rng, features, gaze, noise, count):
             + lost * noise * rng.standard_normal((len(rows), features.shape[1]))
         )
     return mixed
-
-
-def optimise_centres(rng, s, target, n_vectors, free, ridge, start=None):
-    """Centres [n_vectors, d] in 0..255 for the least squares to target [m, 2] at inputs s [m, d] (u8.4).
-
-    Variable projection: for given centres the weights and the trend are a linear least-squares problem, and
-    at its solution the derivative in the centres needs no derivative of the weights (Golub & Pereyra 1973).
-    Bounds keep the centres in the box; in stages the coordinates nearest to integers are frozen there and the
-    rest moves on: rounding all at once at the end costs three times the error. `start` are centres to begin
-    with.
-    """
-    x = s / S_FRAC / U_STEPS
-    linear = np.hstack([np.ones((len(x), 1)), x[:, free] - x[:, free].mean(axis=0)])
-    level = np.sqrt(np.mean((target - target.mean(axis=0)) ** 2))
-    y = (target - target.mean(axis=0)) / max(level, 1e-9)
-    centres = maximin(rng, x, n_vectors) if start is None else start / U_STEPS
-    first = FIRST_STEPS if start is None else LATER_STEPS
-    top = 255.0 / U_STEPS
-    frozen = np.zeros(centres.shape, bool)
-    frozen[:, ~free] = True
-    centres[:, ~free] = 0.0
-    for stage in (0.0,) + ROUNDING:
-        if stage:
-            steps = centres * U_STEPS
-            gap = np.where(frozen, -1.0, np.abs(steps - np.rint(steps)))
-            gap[:, ~free] = -1.0
-            chosen = gap <= np.quantile(gap[:, free], stage)
-            centres = np.where(chosen, np.clip(np.rint(steps), 0, 255) / U_STEPS, centres)
-            frozen = frozen | chosen
-        if frozen.all():
-            break
-        moving = ~frozen
-
-        def objective(values):
-            trial = centres.copy()
-            trial[moving] = values
-            value, slope = _projected(trial, x, linear, y, ridge)
-            return np.log(value), slope[moving] / value  # the scale that L-BFGS's tolerances expect
-
-        found = minimize(
-            objective,
-            centres[moving],
-            jac=True,
-            method="L-BFGS-B",
-            bounds=[(0.0, top)] * int(moving.sum()),
-            options={"maxiter": LATER_STEPS if stage else first, "maxcor": 20, "ftol": 1e-6, "gtol": 1e-6},
-        )
-        centres[moving] = found.x
-    return np.clip(np.rint(centres * U_STEPS), 0, 255).astype(np.int64)
-
-
-def _projected(centres, x, linear, y, ridge):
-    """Mean squared residual with the best weights, and its derivative in the centres."""
-    d2 = np.sum(x * x, 1)[:, None] + np.sum(centres * centres, 1) - 2.0 * (x @ centres.T)
-    k = np.exp(-0.5 * np.maximum(d2, 0.0))
-    design = np.hstack([k, linear])
-    m = len(x)
-    normal = design.T @ design
-    normal[np.diag_indices(len(normal))] += ridge * m
-    w = cho_solve(cho_factor(normal, check_finite=False), design.T @ y, check_finite=False)
-    residual = design @ w - y
-    value = np.sum(residual**2) / m + ridge * np.sum(w**2)
-    pull = (residual @ w[: len(centres)].T) * k
-    slope = 2.0 / m * (pull.T @ x - pull.sum(axis=0)[:, None] * centres)
-    return value, slope
-
-
-def maximin(rng, x, count):
-    """`count` rows of x, each as far as possible from those before it."""
-    pool = x[rng.choice(len(x), min(len(x), 2000), replace=False)]
-    chosen = [int(np.argmin(((pool - pool.mean(axis=0)) ** 2).sum(1)))]
-    nearest = np.full(len(pool), np.inf)
-    while len(chosen) < count:
-        nearest = np.minimum(nearest, ((pool - pool[chosen[-1]]) ** 2).sum(1))
-        chosen.append(int(np.argmax(nearest)))
-    return pool[chosen].copy()
 
 
 def guards(features, offset, gain, noise):
@@ -279,8 +288,11 @@ class FitReport:
     """How a recording became a model.
 
     fixations, frames used; rejected_frames (blinks) and outliers (targets [m, 2] that contradict all others)
-    loo_rms_deg  leave-one-fixation-out error of the fixations' means; lml, condition, jitter of the process
-    length [d] feature units, signal_deg, noise_deg; dropped_channels; distil: DistilReport
+    loo_rms_deg, loo_mean_deg  leave-one-fixation-out error of the fixations' means
+    process  describe() of the full process; lml, condition and jitter are those of the process on the means, whose
+    likelihood was maximised
+    length [d] feature units, signal_deg, noise_deg; dropped_channels
+    aim_deg  rms distance that chose the number of vectors, or None;  cycles on the Nano;  distil: DistilReport
     """
 
     fixations: int
@@ -288,6 +300,7 @@ class FitReport:
     rejected_frames: int
     outliers: list
     loo_rms_deg: float
+    loo_mean_deg: float
     lml: float
     condition: float
     jitter: float
@@ -295,65 +308,42 @@ class FitReport:
     signal_deg: float
     noise_deg: float
     dropped_channels: tuple
+    process: dict
+    aim_deg: float
+    cycles: int
     distil: DistilReport
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # the matrices are small: threads cost 20 times their gain
-def fit_recording(recording, n_vectors=64, seed=0):
-    """Recording -> FitResult. Raises RecordingError or CalibrationError; warns of channels it drops and of
-    a recording that hardly depends on its targets.
+def fit_recording(recording, n_vectors=None, seed=0, kernel="rbf", p=None, budget_cycles=None, progress=None):
+    """Recording -> FitResult. Raises RecordingError, CalibrationError or ModelError; warns of channels it drops
+    and of a recording that hardly depends on its targets.
 
-    Length scales and noise are learnt from the fixations' means, of which each is one observation. The final
-    process is then given single frames, with that noise each: the device judges single frames, and a process
-    that has only seen means trusts directions that their noise fills. On simulated persons this takes 5 % off
-    the error of frames; likelihood on frames, or noise shared within fixations, makes it worse (frames of a
-    fixation agree for free).
+    n_vectors      None chooses: choose.py
+    kernel, p      of the full process, see kernels.kernel;  budget_cycles  most that an inference may take
+    progress       called as progress(stage, done, total)
     """
-    fixed = fixations(recording)
-    learnt = _learn(fixed, seed)
-    lost = []
-    for _ in range(OUTLIER_ROUNDS):
-        predicted, spread = learnt.loo()
-        miss = np.linalg.norm(learnt.y - predicted, axis=1) / spread
-        worst = np.flatnonzero(miss > OUTLIER_SIGMAS)
-        worst = worst[np.argsort(-miss[worst])][: max(1, len(miss) // 20)]
-        if not len(worst) or len(fixed.mean) - len(worst) < TARGETS_NEEDED:
-            break
-        gone = [
-            int(np.argmax((fixed.mean == learnt.x[i]).all(1) & (fixed.target == learnt.y[i]).all(1)))
-            for i in worst
-        ]
-        lost += [[float(v) for v in fixed.target[i]] for i in gone]
-        fixed = fixed.without(gone)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            learnt = _learn(fixed, seed)
-    loo_rms_deg = float(np.sqrt(np.mean(np.sum((learnt.y - learnt.loo()[0]) ** 2, axis=1))))
-    if loo_rms_deg > LOO_DOUBTFUL_DEG:
-        warnings.warn(
-            f"targets that are left out are missed by {loo_rms_deg:.1f} deg: this recording says little "
-            "about where the eye looked; check the headset's seat and record again, with more targets"
-        )
-    rows = _thin(fixed.frames(max(1, min(FRAMES_EACH, ROWS_MAX // len(fixed.mean)))), ROWS_MAX)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        gp = GaussianProcess.fit(
-            *spread_out(fixed, rows, seed),
-            hyper=learnt.hyper,
-            mean=MEAN,
-            noise_scale=fixed.noise_scale()[fixed.label[rows]],
-        )
-    cloud = fixed.frames(CLOUD_EACH)
-    model, report = distil(gp, fixed.features[cloud], fixed.target_deg[cloud], n_vectors, seed, fixed.noise)
+    say = (lambda part: progress("fit", round(100 * part), 100)) if progress else (lambda part: None)
+    say(0.0)
+    most = choose.most_vectors(budget_cycles, n_vectors)
+    process = fit_process(recording, seed, kernel, p)
+    say(0.2)
+    aim_deg = None if n_vectors else choose.aim_deg(process.loo_rms_deg, budget_cycles)
+    model, report = distil(
+        process.gp, *process.cloud(), most, seed, process.noise, None, aim_deg, lambda part: say(0.2 + 0.8 * part)
+    )
+    fixed, learnt = process.fixed, process.learnt
+    say(1.0)
     return FitResult(
-        gp,
+        process.gp,
         model,
         FitReport(
             len(fixed.mean),
             len(fixed.features),
             fixed.rejected,
-            lost,
-            loo_rms_deg,
+            process.outliers,
+            process.loo_rms_deg,
+            process.loo_mean_deg,
             learnt.lml,
             learnt.condition,
             learnt.jitter,
@@ -361,41 +351,9 @@ def fit_recording(recording, n_vectors=64, seed=0):
             learnt.hyper.signal_deg,
             learnt.hyper.noise_deg,
             learnt.dropped,
+            process.gp.describe(),
+            aim_deg,
+            choose.cycles(model.vectors),
             report,
         ),
     )
-
-
-def spread_out(fixed, rows, seed):
-    """Frames `rows` of the Fixations, each moved to a place near its target: (features [n, d], gaze [n, 2]).
-
-    Targets stand some degrees apart, and the features bend between them (the ring of the limbus is 2 degrees
-    wide). The map from gaze to features is smooth and two-dimensional, so that far fewer points tell it than
-    its inverse: frames are moved along it by up to half the distance between targets, noise and pupil
-    included.
-    """
-    target, place = fixed.target_deg[rows], fixed.target
-    few = _thin(np.arange(len(place)), LEARN_MAX)
-    low, high = place.min(axis=0), place.max(axis=0)
-    reach_deg = 0.5 * np.sqrt(np.prod(np.maximum(high - low, 1e-6)) / len(place))
-    rng = np.random.default_rng([0x6D6F76, seed])
-    moved = np.clip(target + rng.uniform(-reach_deg, reach_deg, target.shape), low, high)
-    features = fixed.features[rows].copy()
-    for pair in np.array_split(np.arange(features.shape[1]), (features.shape[1] + 1) // 2):
-        forward = GaussianProcess.fit(
-            place[few], fixed.mean[few][:, [pair[0], pair[-1]]], mean=MEAN, length_max=LENGTH_MAX, restarts=0
-        )
-        step = forward.predict(moved) - forward.predict(target)
-        features[:, pair] += step[:, : len(pair)]
-    return features, moved
-
-
-def _learn(fixed, seed):
-    rows = _thin(np.arange(len(fixed.mean)), LEARN_MAX)
-    known = fixed.mean[rows], fixed.target[rows], fixed.noise_scale()[rows]
-    return GaussianProcess.fit(*known, mean=MEAN, seed=seed, length_max=LENGTH_MAX)
-
-
-def _thin(rows, most):
-    """At most `most` of the rows, evenly spread."""
-    return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(int)]

@@ -1,41 +1,112 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A device model's numbers as the device's integers, and the proof that their sum fits the accumulator."""
+"""An expansion's numbers as the device's integers: gains, centres, then trend, weights and bias."""
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from .model import BIAS_MAX, S_FRAC, S_MAX, U_STEPS, WEIGHT_FRAC_BITS, DeviceModel, kernel_q16
+from .expansion import Expansion, Problem
+from .model import (
+    BIAS_MAX,
+    S_FRAC,
+    S_MAX,
+    U_STEPS,
+    WEIGHT_FRAC_BITS,
+    DeviceModel,
+    kernel_q16,
+    weighed,
+)
+from .reach import reach
 
-KERNEL_ERROR = 3.0  # of a device kernel value, Q0.16 steps
-CELL, CELLS_MAX = 0.2, 20_000  # length scales; see reach()
+LENGTH_STEPS = U_STEPS * S_FRAC  # input steps per length scale
+CENTRE_TOP = 255.0 / U_STEPS  # length scales from a channel's offset to the farthest centre
+BOX = S_MAX / LENGTH_STEPS  # and to the end of its inputs
+GAIN_MAX = 65535
+STAGES, STAGE_STEPS = (0.5, 0.75, 0.9), 4
+ACCUMULATOR = 2**23
+OUTPUT_ERROR_DEG = 2.0**-8
 
 
-def assemble(s, target, centres, offset, gain, rails, ridge):
+def integer_box(gains, middle, width):
+    """Offsets and gain_q12, int64 [d], of inputs z = (feature - middle) / width at gains a.
+
+    The range of the kernel's inputs lies evenly about `middle`, or begins at feature 0 where it would begin below.
+    """
+    gain_q12 = np.clip(np.floor(gains * LENGTH_STEPS * 4096.0 / width), 1, GAIN_MAX).astype(np.int64)
+    half = 0.5 * S_MAX * 4096.0 / gain_q12
+    return np.clip(np.floor(middle - half), 0, 65535).astype(np.int64), gain_q12
+
+
+def integer_centres(expansion, s, target, offset, gain_q12, middle, width):
+    """Centres [n, d] 0..255 of an expansion whose gains have become offset and gain_q12.
+
+    s [m, d] inputs of the kernel, target [m, 2]. In stages the coordinates nearest to integers are frozen there
+    and the rest moves on: with few vectors, rounding all at once costs a tenth of the error.
+    """
+    unit = 4096.0 * LENGTH_STEPS / gain_q12  # features per length scale
+    centres = np.clip(expansion.centres * width / unit / expansion.gains + (middle - offset) / unit, 0.0, CENTRE_TOP)
+    one, none = np.ones(len(unit)), np.zeros(len(unit))
+    problem = Problem(
+        s / LENGTH_STEPS, target, expansion.problem.ridge, np.stack([one, one]), none, CENTRE_TOP, none
+    )
+    frozen = np.zeros(centres.shape, bool)
+    for stage in STAGES:
+        steps = centres * U_STEPS
+        gap = np.where(frozen, -1.0, np.abs(steps - np.rint(steps)))
+        frozen = frozen | (gap <= np.quantile(gap, stage))
+        centres = np.where(frozen, np.clip(np.rint(steps), 0, 255) / U_STEPS, centres)
+        centres = Expansion(problem, one, centres).improved(STAGE_STEPS, frozen).centres
+    return np.clip(np.rint(centres * U_STEPS), 0, 255).astype(np.int64)
+
+
+def assemble(s, target, centres, offset, gain_q12, ridge, trust_of):
     """Trend, weights and bias in the device's integers, on the device's own kernel values.
 
-    Takes the finest weight format whose weights fit 16 bits and whose sum provably fits 32.
+    Takes the finest weight format whose weights fit 16 bits and whose sum provably fits 24.
+    s [m, d] inputs of the kernel, target [m, 2] deg; ridge of a squared weight per sample, deg^-2
+    trust_of(model) -> trust.Trust for a model that has none yet
     Returns (DeviceModel, (proven bound of |gaze| in degrees, what the accumulator holds)), or None when none
     fits.
     """
-    k = kernel_q16(s, centres) / 65536.0
-    design = np.hstack([k, s / 4096.0, np.ones((len(s), 1))])
+    k = kernel_q16(s, centres)
+    design = np.hstack([k / 65536.0, s / 4096.0, np.ones((len(s), 1))])
     n, d = len(centres), s.shape[1]
-    normal = design.T @ design
+    damped = design.T @ design + np.diag(np.r_[np.full(n, ridge), np.full(d, 1e-9), 0.0]) * len(s)
+    moment, trust = design.T @ target, None
     for bits in reversed(WEIGHT_FRAC_BITS):
-        damped = normal + np.diag(np.r_[np.full(n, ridge), np.full(d, 1e-9), 0.0]) * len(s)
         fine, trend_unit = 2.0 ** -(bits + 8), 2.0 ** -(bits + 12)
         unit = np.r_[np.full(n, 2.0**-bits), np.full(d, 4096.0 * trend_unit), trend_unit]
-        whole = _round_in_turn(
-            damped, design.T @ target, unit, np.r_[np.arange(n, n + d), np.arange(n), n + d]
-        )
-        weights, trend, bias = whole[:n], whole[n : n + d].T, whole[-1]
-        if np.abs(weights).max() > 32767 or np.abs(trend).max() > 32767 or np.abs(bias).max() > BIAS_MAX:
+        whole = _round_in_turn(damped, moment, unit, np.r_[np.arange(n, n + d), np.arange(n), n + d])
+        weights, trend = whole[:n], whole[n : n + d].T
+        if np.abs(weights).max() > 32767 or np.abs(trend).max() > 32767:
             continue
-        bound = reach(weights, trend, bias, centres, rails)
-        if bound < 2**23:
-            model = DeviceModel.from_parts(offset, gain, bias, trend, centres, weights, bits, rails)
-            return model, (float(bound * fine), float(2**23 * fine))
+        # The bias last, on the device's own sums: it takes the mean of all that they leave out.
+        rest = target / fine - weighed(k, weights) - (s @ trend.T >> 4)
+        bias = np.rint(16.0 * rest.mean(axis=0)).astype(np.int64)
+        if np.abs(bias).max() > BIAS_MAX:
+            continue
+        parts = offset, gain_q12, bias, trend, centres, weights, bits
+        if trust is None:
+            trust = trust_of(DeviceModel.from_parts(*parts))
+        bound = reach(weights, trend, bias, centres, trust)
+        if bound < ACCUMULATOR:
+            return DeviceModel.from_parts(*parts, trust), (float(bound * fine), float(ACCUMULATOR * fine))
     return None
+
+
+def error_bound_deg(model):
+    """Bound of the device's arithmetic, degrees: its angle against the same expansion in real numbers.
+
+    The expansion is that of the stored centres, half squares, weights, trend and bias at the same inputs s, plus a
+    constant: half of the most that the left-out products of low bytes can come to. Errors: kernels 4 steps of
+    2^-16 (sg_gp.h); the left-out products, then within half of their range; floors of one accumulator step;
+    rounding of the result to 1/128 deg.
+    """
+    from .reach import KERNEL_ERROR
+
+    step = 2.0 ** -(model.weight_frac_bits + 8)
+    kernels = KERNEL_ERROR / 256.0 * np.abs(model.weights).sum(axis=0)
+    products = 0.5 * 255.0 / 256.0 * (model.weights & 255).sum(axis=0)
+    return float(np.max(kernels + products + 1.0) * step + OUTPUT_ERROR_DEG)
 
 
 def _round_in_turn(normal, moment, unit, order):
@@ -57,67 +128,3 @@ def _round_in_turn(normal, moment, unit, order):
         value = value - np.outer(inverse[:, i], error)
         inverse = inverse - np.outer(inverse[:, i], inverse[i]) / inverse[i, i]
     return whole
-
-
-def reach(weights, trend, bias, centres, rails):
-    """Bound of |bias + trend . s + sum w k| over every input that no guard flags, in accumulator steps.
-
-    The guards' parallelepiped is cut into cells. Within a cell of half widths h around c, with f the sum of
-    kernels and L the length scale,   |value - value(c)| <= |gradient(c) . h| + sqrt(3)/2 |f| |h|^2 / L^2 :
-    f is a member of the kernel's function space, where |f| = sqrt(w' K w) and every second derivative is at
-    most |f| times the square root of the kernel's fourth, 3 / L^4. Each of the device's kernel values is
-    within KERNEL_ERROR of the exact (sg_gp.h).
-    """
-    live = np.flatnonzero(centres.any(axis=0) | np.any(trend, axis=0))
-    rows, low, high = _slabs(rails, live)
-    length = U_STEPS * S_FRAC
-    columns = np.linalg.inv(rows) / length
-    extent = np.linalg.norm(columns, axis=0) * (high - low)
-    cell = CELL
-    while np.prod(np.ceil(extent / cell)) > CELLS_MAX:
-        cell *= 1.1
-    cuts = np.ceil(extent / cell).astype(int)
-    parts = [lo + (np.arange(cut) + 0.5) * (hi - lo) / cut for lo, hi, cut in zip(low, high, cuts)]
-    middle = np.stack([g.ravel() for g in np.meshgrid(*parts, indexing="ij")], axis=1) @ columns.T
-    half = columns * (high - low) / (2 * cuts)
-    size2 = np.abs(half.T @ half).sum()
-    overlap = np.abs(half).sum(axis=1)  # cells outside the box hold no input
-    middle = middle[((middle > -overlap) & (middle < S_MAX / length + overlap)).all(axis=1)]
-    spot = centres[:, live] / U_STEPS
-    gram = np.exp(-0.5 * ((spot[:, None] - spot) ** 2).sum(-1))
-    norm = np.sqrt(
-        np.maximum(np.einsum("io,ij,jo->o", weights.astype(float), gram, weights.astype(float)), 0.0)
-    )
-    worst = 0.0
-    for block in np.array_split(middle, max(1, len(middle) // 2000)):
-        k = 256.0 * np.exp(-0.5 * ((block[:, None] - spot) ** 2).sum(-1))
-        for o in range(2):
-            w, slope = weights[:, o].astype(float), trend[o, live].astype(float) * length / 16
-            value = bias[o] / 16 + block @ slope + k @ w
-            gradient = slope + (k * w) @ spot - (k @ w)[:, None] * block
-            spread = np.abs(gradient @ half).sum(axis=1) + 256.0 * np.sqrt(3.0) / 2 * norm[o] * size2
-            worst = max(worst, np.max(np.abs(value) + spread) + KERNEL_ERROR / 256 * np.abs(w).sum() + 256.0 * len(w))
-    return float(worst * (1.0 + 1e-9))
-
-
-def _slabs(rails, live):
-    """Rows [d, d] and their ranges that hold every input in the box and within the guards.
-
-    The guards' directions are completed to all d by axes of the box, most independent first.
-    """
-    d = len(live)
-    rows, low, high = [], [], []
-    for row, least, most in zip(rails.row[:, live].astype(float), rails.low, rails.high):
-        rows.append(row)
-        low.append(16.0 * least - 15.0 * np.maximum(-row, 0).sum())
-        high.append(16.0 * most + 15.0 * np.maximum(row, 0).sum())
-    for _ in range(d - len(rows)):
-        free = np.eye(d)
-        if rows:
-            basis = np.linalg.qr(np.array(rows).T)[0]
-            free = free - basis @ basis.T
-        axis = int(np.argmax(np.linalg.norm(free, axis=0)))
-        rows.append(np.eye(d)[axis])
-        low.append(0.0)
-        high.append(float(S_MAX))
-    return np.array(rows[:d]), np.array(low[:d]), np.array(high[:d])
