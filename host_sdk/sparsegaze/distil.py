@@ -289,8 +289,7 @@ class FitReport:
 
     fixations, frames used; rejected_frames (blinks) and outliers (targets [m, 2] that contradict all others)
     loo_rms_deg, loo_mean_deg  leave-one-fixation-out error of the fixations' means
-    process  describe() of the full process; lml, condition and jitter are those of the process on the means, whose
-    likelihood was maximised
+    lml, condition, jitter  of the process on the means, whose likelihood was maximised
     length [d] feature units, signal_deg, noise_deg; dropped_channels
     aim_deg  rms distance that chose the number of vectors, or None;  cycles on the Nano;  distil: DistilReport
     """
@@ -308,7 +307,6 @@ class FitReport:
     signal_deg: float
     noise_deg: float
     dropped_channels: tuple
-    process: dict
     aim_deg: float
     cycles: int
     distil: DistilReport
@@ -351,7 +349,6 @@ def fit_recording(recording, n_vectors=None, seed=0, kernel="rbf", p=None, budge
             learnt.hyper.signal_deg,
             learnt.hyper.noise_deg,
             learnt.dropped,
-            process.gp.describe(),
             aim_deg,
             choose.cycles(model.vectors),
             report,

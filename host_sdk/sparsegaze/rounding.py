@@ -87,7 +87,7 @@ def assemble(s, target, centres, offset, gain_q12, ridge, trust_of):
         parts = offset, gain_q12, bias, trend, centres, weights, bits
         if trust is None:
             trust = trust_of(DeviceModel.from_parts(*parts))
-        bound = reach(weights, trend, bias, centres, trust)
+        bound = reach(weights, trend, bias, centres, trust, 0.99 * ACCUMULATOR)
         if bound < ACCUMULATOR:
             return DeviceModel.from_parts(*parts, trust), (float(bound * fine), float(ACCUMULATOR * fine))
     return None

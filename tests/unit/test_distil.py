@@ -8,14 +8,17 @@ import pytest
 
 from sparsegaze import distil as module
 from sparsegaze import fixations as fixations_module
-from sparsegaze import rounding
+from sparsegaze import process, rounding
 from sparsegaze.distil import distil, fit_recording
 from sparsegaze.errors import CalibrationError, ModelError, RecordingError
 from sparsegaze.fixations import TARGETS_NEEDED, fixations
 from sparsegaze.gp import GaussianProcess
 from sparsegaze.metrics import frame_errors_deg
-from sparsegaze.model import FLAG_OUT_OF_RANGE, FLAG_VALID, emulate, kernel_q16
+from sparsegaze.expansion import Expansion, Problem
+from sparsegaze.model import FLAG_OUT_OF_RANGE, FLAG_VALID, emulate, kernel_q16, weighed
+from sparsegaze.reach import reach
 from sparsegaze.recording import Recording
+from sparsegaze.trust import Trust
 
 FRAME_NOISE = 10.0  # feature steps rms
 
@@ -61,16 +64,15 @@ def errors(model, eye, seed=99, reach=19.0):
 
 @pytest.fixture
 def quick(monkeypatch):
-    """A tenth of the optimiser's steps, for tests that do not ask how good the model is."""
-    monkeypatch.setattr(module, "FIRST_STEPS", 100)
-    monkeypatch.setattr(module, "LATER_STEPS", 20)
-    monkeypatch.setattr(module, "POINTS", 2000)
+    """Few inputs and steps, for tests that do not ask how good the model is."""
+    for name, value in (("FIRST_STEPS", 5), ("LATER_STEPS", 2), ("POLISH_STEPS", 8), ("POINTS", 1500)):
+        monkeypatch.setattr(module, name, value)
 
 
 @pytest.fixture(scope="module")
 def fitted():
     eye = Eye(0)
-    return eye, fit_recording(eye.recording())
+    return eye, fit_recording(eye.recording(), n_vectors=64)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -114,42 +116,90 @@ def test_report_states_what_the_image_holds(fitted):
     weights = model.weights / 2.0**model.weight_frac_bits
     assert (report.n_vectors, report.weight_frac_bits) == (model.vectors, model.weight_frac_bits)
     assert report.weight_range_deg == (weights.min(), weights.max())
-    assert report.reach_deg[1] == 2.0 ** (31 - 16 - model.weight_frac_bits)
+    assert report.reach_deg[1] == 2.0 ** (23 - 8 - model.weight_frac_bits)
+
+
+def accumulator(model, s):
+    return (model.bias + s @ model.trend.T >> 4) + weighed(kernel_q16(s, model.centres), model.weights)
+
+
+def within(model, rng, count=100_000):
+    """Inputs all over the guards' parallelepiped, its corners included, as far as they lie in the box."""
+    trust = model.trust
+    rows, low, high = trust.row.astype(float), 256.0 * trust.low, 256.0 * trust.high
+    rest = np.linalg.svd(rows)[2][len(rows) :]
+    part = rng.random((count, 6))
+    part[: count // 2] = part[: count // 2] < 0.5
+    ends = np.c_[np.r_[low, np.full(len(rest), -3000.0)], np.r_[high, np.full(len(rest), 7000.0)]]
+    s = np.rint(np.linalg.solve(np.vstack([rows, rest]), (ends[:, 0] + part * np.diff(ends).T).T).T).astype(int)
+    return s[((s >= 0) & (s <= 4095)).all(axis=1)]
 
 
 def test_the_sum_cannot_wrap_on_any_input_that_is_not_flagged_and_the_bound_is_not_idle(fitted):
     model, report = fitted[1].model, fitted[1].report.distil
     assert report.reach_deg[0] < report.reach_deg[1]
-    # Inputs all over the guards' parallelepiped, its corners included.
-    rng = np.random.default_rng(0)
-    rows = np.array([row for _, _, row in model.guards])
-    low, high = (np.array([guard[i] for guard in model.guards]) for i in (0, 1))
-    part = rng.random((100_000, 6))
-    part[:50_000] = part[:50_000] < 0.5
-    s = np.rint(np.linalg.solve(rows, (low + part * (high - low)).T).T).astype(int)
-    s = s[((s >= 0) & (s <= 4095)).all(axis=1)]
-    total = model.bias + s @ model.trend.T + kernel_q16(s, model.centres) @ model.weights
-    worst = np.abs(total).max() / 2.0 ** (16 + model.weight_frac_bits)
+    s = within(model, np.random.default_rng(0))
+    worst = np.abs(accumulator(model, s)).max() / 2.0 ** (8 + model.weight_frac_bits)
     assert len(s) > 1000 and worst < report.reach_deg[0] < 10 * worst
+
+
+def slabs(least, most, rows=127 * np.eye(6, dtype=int)):
+    none = np.zeros(len(rows), int)
+    return Trust(rows, none, none + least, none + most, np.zeros((0, 0, len(rows)), int))
 
 
 def test_reach_is_tight_for_one_kernel_cancelling_kernels_and_a_trend():
     # One kernel in a small parallelepiped round its centre: the bound is its weight, attained at the centre.
-    rails = [(127 * 400, 127 * 560, row) for row in 127 * np.eye(6, dtype=int)]
+    box = slabs(220, 255)
     none = np.zeros((2, 6), int), np.zeros(2, int)
-    bound = rounding.reach(np.array([[100, -50]]), *none, np.full((1, 6), 30), rails)
-    assert 65535 * 100 <= bound <= 1.05 * 65536 * 100
+    bound = reach(np.array([[256, -256]]), *none, np.full((1, 6), 30), box)
+    assert 255 * 256 <= bound <= 1.05 * 256 * 256
     # Two kernels of opposite weight in nearly the same place cancel: far below the sum of the weights.
-    pair = rounding.reach(np.array([[100, 0], [-100, 0]]), *none, np.array([[30] * 6, [31] * 6]), rails)
-    assert pair < 0.1 * bound
+    pair = reach(np.array([[2560, 0], [-2560, 0]]), *none, np.array([[30] * 6, [31] * 6]), box)
+    assert pair < 0.1 * 10 * bound
     # A trend alone is bounded by its value at the far corner.
-    trend = np.array([[7, -3, 0, 0, 0, 2], [0] * 6])
-    corner = 9 * 560 - 3 * 400
-    assert (
-        corner
-        <= rounding.reach(np.zeros((1, 2), int), trend, np.zeros(2, int), np.zeros((1, 6), int), rails)
-        <= 1.001 * corner
-    )
+    trend = np.array([[700, -300, 0, 0, 0, 200], [0] * 6])
+    least, most = 220 * 256 / 127, 256 * 256 / 127
+    corner = (900 * most - 300 * least) / 16
+    found = reach(np.zeros((1, 2), int), trend, np.zeros(2, int), np.zeros((1, 6), int), box)
+    assert corner <= found <= 1.001 * corner
+
+
+@pytest.mark.parametrize("guards", [0, 1, 2, 4])
+def test_reach_holds_with_few_guards_and_with_guards_that_say_the_same_twice(guards):
+    rng = np.random.default_rng(guards)
+    rows = rng.integers(-127, 128, (guards, 6))
+    if guards > 1:
+        rows[1] = rows[0]
+    trust = slabs(-200, 300, rows)
+    weights, centres = rng.integers(-3000, 3000, (12, 2)), rng.integers(0, 256, (12, 6))
+    trend, bias = rng.integers(-300, 300, (2, 6)), rng.integers(-(10**6), 10**6, 2)
+    s = rng.integers(0, 4096, (200_000, 6))
+    s[:100_000] = np.where(s[:100_000] < 2048, 0, 4095)
+    projection = s @ rows.T >> 8
+    s = s[((projection >= -200) & (projection <= 300)).all(axis=1)]
+    total = (bias + s @ trend.T >> 4) + weighed(kernel_q16(s, centres), weights)
+    assert len(s) > 100 and np.abs(total).max() <= reach(weights, trend, bias, centres, trust)
+
+
+def test_reach_stops_when_it_has_proven_enough(fitted):
+    model = fitted[1].model
+    parts = model.weights, model.trend, model.bias, model.centres, model.trust
+    best = reach(*parts)
+    assert best <= reach(*parts, 2.0 * best) <= 2.0 * best
+
+
+def test_the_error_bound_holds_against_real_numbers_and_is_not_idle(fitted):
+    model, rng = fitted[1].model, np.random.default_rng(3)
+    s = np.vstack([within(model, rng, 20_000)[:2000], rng.integers(0, 4096, (2000, 6))])
+    half2 = np.sum(model.centres.astype(float) ** 2, axis=1) + 31
+    t = np.sum(s.astype(float) ** 2, axis=1)[:, None] / 32 + 256 * np.floor(half2 / 32) - s @ model.centres.T
+    lost = 255.0 / 256.0 * (model.weights & 255).sum(axis=0)
+    real = (model.bias + s @ model.trend.T) / 16 + np.exp(-t / 2**16) @ model.weights * 256 - lost / 2
+    q7 = np.floor(accumulator(model, s) / 2.0 ** (model.weight_frac_bits + 1) + 0.5)
+    worst = np.abs(q7 / 128 - real / 2.0 ** (model.weight_frac_bits + 8)).max()
+    assert worst <= rounding.error_bound_deg(model) < 20 * worst
+    assert fitted[1].report.distil.error_bound_deg == rounding.error_bound_deg(model)
 
 
 def test_rounding_in_turn_beats_rounding_at_once():
@@ -166,26 +216,56 @@ def test_rounding_in_turn_beats_rounding_at_once():
     assert cost[0] <= cost[1] < cost[0] + 0.5 * (cost[2] - cost[0])
 
 
+def problem(rng, m=200, d=4, ridge=1e-7):
+    z = rng.uniform(-0.5, 0.5, (m, d))
+    wide = np.full(d, 4.0)
+    return Problem(z, np.sin(3 * z @ rng.standard_normal((d, 2))), ridge, np.stack([0.1 * wide, wide]), -9 * wide, 4.0)
+
+
 def test_variable_projection_gradient_equals_finite_differences():
     rng = np.random.default_rng(0)
-    x, y = rng.uniform(0, 3, (200, 4)), rng.standard_normal((200, 2))
-    linear = np.hstack([np.ones((200, 1)), x])
-    centres = rng.uniform(0, 3, (10, 4))
-    _, slope = module._projected(centres, x, linear, y, 1e-7)
+    task = problem(rng)
+    gains, centres = rng.uniform(1, 3, 4), rng.uniform(-1.5, 1.5, (10, 4))
+    by_centre, by_gain = Expansion(task, gains, centres).gradient()
     for i, j in [(0, 0), (4, 2), (9, 3)]:
         step = np.zeros_like(centres)
         step[i, j] = 1e-5
-        up, down = (module._projected(centres + s, x, linear, y, 1e-7)[0] for s in (step, -step))
-        assert slope[i, j] == pytest.approx((up - down) / 2e-5, rel=1e-4, abs=1e-9)
+        up, down = (Expansion(task, gains, centres + s).cost for s in (step, -step))
+        assert 2 / 200 * by_centre[i, j] == pytest.approx((up - down) / 2e-5, rel=1e-4, abs=1e-9)
+    for j in range(4):
+        grown = [np.exp(s * (np.arange(4) == j)) for s in (1e-5, -1e-5)]
+        up, down = (Expansion(task, gains * g, centres * g).cost for g in grown)
+        assert 2 / 200 * by_gain[j] == pytest.approx((up - down) / 2e-5, rel=1e-4, abs=1e-9)
+
+
+def test_steps_never_leave_the_bounds_never_make_it_worse_and_leave_frozen_centres_alone():
+    rng = np.random.default_rng(1)
+    task = problem(rng)
+    start = Expansion(task, np.full(4, 3.5), rng.uniform(-2, 2, (12, 4)))
+    better = start.improved(30)
+    assert better.cost < 0.5 * start.cost
+    assert (np.abs(better.centres) <= 2.0).all() and (better.gains <= 4.0).all()
+    frozen = rng.random((12, 4)) < 0.5
+    part = start.improved(30, frozen)
+    assert part.cost < start.cost and (part.gains == start.gains).all()
+    assert (part.centres[frozen] == start.centres[frozen]).all() and (part.centres != start.centres).any()
+
+
+def test_the_centre_that_is_removed_is_the_one_that_costs_least():
+    rng = np.random.default_rng(2)
+    start = Expansion(problem(rng), np.full(4, 2.0), rng.uniform(-1, 1, (9, 4)))
+    costs = [Expansion(start.problem, start.gains, np.delete(start.centres, i, axis=0)).cost for i in range(9)]
+    assert start.without(1).cost == pytest.approx(min(costs), rel=1e-9)
+    assert len(start.without(4).centres) == 5
 
 
 def test_same_seed_same_image_and_the_order_of_rows_is_irrelevant(fitted, quick):
     recording = fitted[0].recording()
-    first = fit_recording(recording)
-    assert fit_recording(recording).model.image == first.model.image
+    first = fit_recording(recording, 32)
+    assert fit_recording(recording, 32).model.image == first.model.image
     shuffled = recording.select(np.random.default_rng(1).permutation(len(recording)))
-    assert fit_recording(shuffled).model.image == first.model.image
-    assert fit_recording(recording, seed=1).model.image != first.model.image
+    assert fit_recording(shuffled, 32).model.image == first.model.image
+    assert fit_recording(recording, 32, seed=1).model.image != first.model.image
 
 
 def test_closed_lids_slip_and_dark_are_flagged(fitted):
@@ -215,7 +295,7 @@ def test_a_constant_channel_is_dropped_with_a_warning_and_ignored_by_the_device(
     recording = eye.recording()
     recording.features[:, 4] = 777
     with pytest.warns(UserWarning, match="s4"):
-        result = fit_recording(recording)
+        result = fit_recording(recording, 32)
     assert result.report.dropped_channels == (4,) and result.model.gain_q12[4] == 0
     assert result.model.channels == 6  # a dropped channel keeps its place: the board still has six
     gaze = np.random.default_rng(0).uniform(-19, 19, (500, 2))
@@ -233,7 +313,7 @@ def test_one_fixation_100_sigma_off_is_left_out_and_named(fitted, quick):
     recording = fitted[0].recording()
     first = (recording.target_deg == recording.target_deg[0]).all(axis=1)
     recording.target_deg[first] = np.clip(-recording.target_deg[0] + [9.0, -7.0], -22, 22)
-    result = fit_recording(recording)
+    result = fit_recording(recording, 32)
     assert len(result.report.outliers) >= 1
     np.testing.assert_allclose(result.report.outliers[0], recording.target_deg[0])
     assert errors(result.model, fitted[0])[0].mean() < 0.4
@@ -243,11 +323,11 @@ def test_a_recording_that_does_not_depend_on_its_targets_warns_and_an_ordinary_o
     recording = Eye(0).recording(targets=49)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert fit_recording(recording, n_vectors=8).report.loo_rms_deg < module.LOO_DOUBTFUL_DEG
+        assert fit_recording(recording, n_vectors=8).report.loo_rms_deg < process.LOO_DOUBTFUL_DEG
     places, label = np.unique(recording.target_deg, axis=0, return_inverse=True)
     recording.target_deg = np.random.default_rng(0).permutation(places)[label.reshape(-1)]
     with pytest.warns(UserWarning, match="says little about where the eye looked"):
-        assert fit_recording(recording, n_vectors=8).report.loo_rms_deg > module.LOO_DOUBTFUL_DEG
+        assert fit_recording(recording, n_vectors=8).report.loo_rms_deg > process.LOO_DOUBTFUL_DEG
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -273,7 +353,7 @@ def test_unmarked_blinks_within_fixations_are_left_out(fitted, quick):
     start = np.arange(0, len(recording), 20)
     for i in range(2):
         recording.features[start + i] = np.rint(0.3 * recording.features[start + i] + 0.7 * (eye.level + 800))
-    result = fit_recording(recording)
+    result = fit_recording(recording, 32)
     assert result.report.rejected_frames >= 2 * len(start)
     assert errors(result.model, eye)[0].mean() < errors(clean.model, eye)[0].mean() + 0.02
 
@@ -287,7 +367,7 @@ def test_nan_in_rows_that_are_not_valid_and_closed_eyes_there_change_nothing(fit
         np.vstack([recording.target_deg, np.full((n, 2), np.nan)]),
         np.r_[recording.valid, np.zeros(n)],
     )
-    assert fit_recording(longer).model.image == fit_recording(recording).model.image
+    assert fit_recording(longer, 32).model.image == fit_recording(recording, 32).model.image
 
 
 @pytest.mark.parametrize("targets", [0, 1, 4])
@@ -304,7 +384,7 @@ def test_fewer_targets_than_needed_are_refused_with_the_number(targets):
 @pytest.mark.parametrize("each", [1, 3])
 def test_nine_points_are_enough_for_a_finite_model(each, quick):
     recording = Eye(0).recording(targets=9, frames=each)
-    result = fit_recording(recording)
+    result = fit_recording(recording, 32)
     az, el, _ = result.model.predict(recording.features)
     assert np.abs(np.stack([az, el], 1) - recording.target_deg).max() < 15
 
@@ -313,13 +393,13 @@ def test_one_row_per_target_and_a_pursuit_are_recordings_too(quick):
     eye, rng = Eye(2), np.random.default_rng(0)
     gaze = rng.uniform(-22, 22, (300, 2))
     single = Recording(np.arange(300) * 10**6, eye.features(gaze, rng), gaze, np.ones(300))
-    assert errors(fit_recording(single).model, eye)[0].mean() < 0.35
+    assert errors(fit_recording(single, 32).model, eye)[0].mean() < 0.35
     time = np.arange(12_000) * 12_000
     path = 22 * np.stack([np.sin(time / 2.9e6), np.sin(time / 20.7e6)], 1)
     pursuit = Recording(time, eye.features(path, rng), path, np.ones(len(time)))
     found = fixations(pursuit)
     assert np.abs(found.target_deg - found.target[found.label]).max() < 1.0
-    assert errors(fit_recording(pursuit).model, eye, reach=15.0)[0].mean() < 0.35
+    assert errors(fit_recording(pursuit, 32).model, eye, reach=15.0)[0].mean() < 0.35
 
 
 def test_channels_of_very_different_scale(quick):
@@ -331,7 +411,7 @@ def test_channels_of_very_different_scale(quick):
 
     recording = eye.recording()
     recording.features = squeeze(recording.features).astype(np.uint16)
-    model = fit_recording(recording).model
+    model = fit_recording(recording, 32).model
     rng = np.random.default_rng(3)
     gaze = rng.uniform(-19, 19, (1000, 2))
     az, el, _ = model.predict(squeeze(eye.features(gaze, rng)).astype(np.uint16))
@@ -351,7 +431,7 @@ def test_fewer_channels_than_six(d, quick):
 
 def test_impossible_vector_counts_are_refused(fitted):
     recording = fitted[0].recording()
-    for n in (0, 217):
+    for n in (0, 235):
         with pytest.raises(ModelError, match=str(n)):
             distil(fitted[1].gp, recording.features, recording.target_deg, n)
     with pytest.raises(CalibrationError):
@@ -361,10 +441,10 @@ def test_impossible_vector_counts_are_refused(fitted):
 def test_the_largest_model_that_fits_a_slot(fitted, quick):
     recording = fitted[0].recording()
     model, report = distil(fitted[1].gp, recording.features, recording.target_deg, 216)
-    assert model.vectors == 216 and len(model.image) <= 3072 and report.rms_deg < 0.02
+    assert model.vectors == 216 and len(model.image) <= 3072 and report.rms_deg < 0.1
 
 
 def test_no_warning_on_ordinary_data(quick):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fit_recording(Eye(4).recording())
+        fit_recording(Eye(4).recording(), 32)
