@@ -58,7 +58,7 @@ class Calibration:
 def run(
     port,
     n_targets=120,
-    vectors=64,
+    vectors=None,
     seed=0,
     n_validation=25,
     folder=None,
@@ -72,7 +72,8 @@ def run(
     """Calibrate the device behind `port` and return a Calibration.
 
     port          port name
-    n_targets     calibration targets, about one second each; vectors: calibration vectors of the device model
+    n_targets     calibration targets, about one second each; vectors: of the device model, None: the fewest
+                  that do
     seed          of the target plans; n_validation: held-out targets afterwards, 0 for none
     folder        where recording.csv, model.sgm and report.json are kept, made if missing; None keeps nothing
     upload        False stops after the fit
@@ -103,11 +104,7 @@ def run(
             taken = capture.run(device, shown, plan, path, meta, progress)
             try:
                 capture.check(taken)
-                if progress:
-                    progress("fit", 0, 1)
-                fitted = fit_recording(taken.recording, n_vectors=vectors)
-                if progress:
-                    progress("fit", 1, 1)
+                fitted = fit_recording(taken.recording, n_vectors=vectors, progress=progress)
                 if folder:
                     fitted.model.save(os.path.join(folder, MODEL))
                 done = Calibration(taken, fitted, None, None, folder)

@@ -4,12 +4,15 @@
 import numpy as np
 
 from .errors import ModelError
-from .model import HEAD_BYTES, RECORD_BYTES, VECTORS_MAX
+from .model import HEAD_BYTES, RECORD_BYTES, SLOT_BYTES
+from .trust import NODE_BYTES
+from .trustfit import CELLS_MAX
 
 # Cycles of sg_gp_predict on the ATmega328P with the assembly loop, the same for every input: those of a model
 # without vectors, and of a vector. tests/unit/test_fit_choice.py holds them against tests/budget.csv.
 CYCLES_BASE, CYCLES_EACH = 5500, 155
 MOST = 128  # vectors chosen without being asked for: past this nothing is gained
+ROOM = (SLOT_BYTES - HEAD_BYTES - NODE_BYTES * (CELLS_MAX + 1) ** 2) // RECORD_BYTES  # beside any grid
 AIM_DEG = 0.05  # rms distance to the full process
 LOSS = 1.05  # and the truth error may be this much the full process's
 FINE_DEG = 0.01  # rms distance below which more vectors change nothing: the output has steps of 1/128 deg
@@ -20,14 +23,11 @@ def cycles(vectors):
     return CYCLES_BASE + CYCLES_EACH * vectors
 
 
-def image_bytes(vectors, grid_bytes=0):
-    """Bytes of a stored model."""
-    return HEAD_BYTES + grid_bytes + RECORD_BYTES * vectors
-
-
 def most_vectors(budget_cycles=None, n_vectors=None):
     """Vectors to make at most, from a wish and a budget (either may be None). Raises ModelError."""
-    most = n_vectors or (MOST if budget_cycles is None else VECTORS_MAX)
+    if n_vectors is not None and not 1 <= n_vectors <= ROOM:
+        raise ModelError(f"{n_vectors} vectors do not fit the device", f"ask for 1 to {ROOM}")
+    most = n_vectors or (MOST if budget_cycles is None else ROOM)
     if budget_cycles is None:
         return most
     fitting = int((budget_cycles - CYCLES_BASE) // CYCLES_EACH)
@@ -44,8 +44,10 @@ def most_vectors(budget_cycles=None, n_vectors=None):
 def aim_deg(loo_deg, budget_cycles=None):
     """Rms distance from the full process, degrees, at which more vectors are of no use.
 
-    loo_deg  leave-one-fixation-out error of the full process. A distance independent of its error adds as squares
-    do; together they may be LOSS times the error. With a budget in cycles the vectors are there to be used: the
+    loo_deg  leave-one-fixation-out error of the full process. A distance independent of its error adds as
+    squares
+    do; together they may be LOSS times the error. With a budget in cycles the vectors are there to be used:
+    the
     aim is then FINE_DEG.
     """
     if budget_cycles is not None:

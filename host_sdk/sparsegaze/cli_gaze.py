@@ -11,7 +11,9 @@ import click
 from .cli_device import json_option, port_argument
 from .console import Console, pairs, table
 
-VECTORS = click.IntRange(1, 216)
+VECTORS = click.IntRange(1, 164)  # choose.ROOM
+VECTORS_HELP = "Calibration vectors of the device's model.  [default: the fewest that do]"
+KERNELS = ("rbf", "matern52", "laplace", "minkowski", "canberra", "cosine")
 
 
 def screen_options(command):
@@ -99,9 +101,7 @@ def _accuracy_lines(report):
 @click.option(
     "--vectors",
     type=VECTORS,
-    default=64,
-    show_default=True,
-    help="Calibration vectors of the device's model.",
+    help=VECTORS_HELP,
 )
 @click.option(
     "--validation",
@@ -231,53 +231,49 @@ def record(port, output, n_targets, seed, distance_mm, width_mm, windowed, as_js
 @click.option(
     "-o", "--output", type=click.Path(dir_okay=False), help="Model file to write.  [default: FILE with .sgm]"
 )
+@click.option("--vectors", type=VECTORS, help=VECTORS_HELP)
 @click.option(
-    "--vectors", type=VECTORS, default=64, show_default=True, help="Calibration vectors of the model."
+    "--kernel",
+    type=click.Choice(KERNELS),
+    default="rbf",
+    show_default=True,
+    help="Distance measure of the full process. The device's own kernel is always the rbf.",
+)
+@click.option("--p", type=click.FloatRange(0.0, min_open=True), help="Order of the Minkowski distance.")
+@click.option(
+    "--budget-cycles",
+    type=click.IntRange(min=1),
+    help="Most cycles an inference may take on the Nano: as many vectors as fit, unless fewer do as well.",
 )
 @json_option
-def fit(file, output, vectors, as_json):
-    """Make a model from a recording: a Gaussian process in float64, distilled to VECTORS fixed-point vectors.
+def fit(file, output, vectors, kernel, p, budget_cycles, as_json):
+    """Make a model from a recording: a Gaussian process in float64, distilled to a few fixed-point vectors.
 
     Any CSV with the columns t_us, s0.., target_az_deg, target_el_deg, valid can be fitted, whoever made it.
 
     \b
     Example:
-        sparsegaze fit eye.csv -o eye.sgm --vectors 64
+        sparsegaze fit eye.csv -o eye.sgm
+        sparsegaze fit eye.csv --budget-cycles 7000 --json
     """
-    from .calibrate import plain
     from .distil import fit_recording
+    from .fitreport import lines, summary
     from .recording import Recording
 
     console = Console(as_json)
     recording = Recording.read(file)
     with console.progress() as progress, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        progress("fit", 0, 1)
-        fitted = fit_recording(recording, n_vectors=vectors)
-        progress("fit", 1, 1)
+        fitted = fit_recording(
+            recording, vectors, kernel=kernel, p=p, budget_cycles=budget_cycles, progress=progress
+        )
     doubts = [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
     for doubt in doubts:
         console.warn(doubt)
     output = output or os.path.splitext(file)[0] + ".sgm"
     fitted.model.save(output)
-    report = plain(fitted.report)
-    console.result(
-        {
-            "file": output,
-            "n_vectors": fitted.model.vectors,
-            "crc": fitted.model.crc,
-            "report": report,
-            "warnings": doubts,
-        },
-        f"{output}: {fitted.model.vectors} vectors, crc 0x{fitted.model.crc:08X}",
-        *_report_lines(report),
-    )
-
-
-def _report_lines(report):
-    if not isinstance(report, dict):
-        return []
-    return pairs((name, value) for name, value in report.items() if isinstance(value, (int, float, str)))
+    report = summary(fitted)
+    console.result({"file": output, **report, "warnings": doubts}, output, *pairs(lines(report)))
 
 
 @click.command()

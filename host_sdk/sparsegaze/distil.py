@@ -2,8 +2,10 @@
 """From a float64 Gaussian process to the few integer vectors that an 8-bit device can carry.
 
 The device's mean is  bias + trend . s + sum_i w_i k(s, c_i)  (firmware/core/sg_model.h). Everything in it is
-fitted to the process's mean over a cloud of likely inputs: gains and centres in real numbers (expansion.py), then
-rounded in stages; then trend, weights and bias, one after the other, on the integer kernel values of the device
+fitted to the process's mean over a cloud of likely inputs: gains and centres in real numbers (expansion.py),
+then
+rounded in stages; then trend, weights and bias, one after the other, on the integer kernel values of the
+device
 itself, so that the rounding of each is made good by those still free (rounding.py). The process may have any
 kernel; the device's is always the RBF. DESIGN.md section 5; notes on what each step buys stand beside it.
 """
@@ -13,19 +15,27 @@ from dataclasses import dataclass
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from . import choose
-from .errors import CalibrationError, ModelError
+from . import choose, trustfit
+from .errors import CalibrationError
 from .expansion import Problem, pruned, spread_start
 from .gp import GaussianProcess
-from .model import CHANNELS, VECTORS_MAX, DeviceModel, emulate, quantise
-from .process import fit_process
-from .rounding import BOX, CENTRE_TOP, GAIN_MAX, LENGTH_STEPS, assemble, error_bound_deg, integer_box, integer_centres
-from .trust import GUARDS, Trust
+from .model import CHANNELS, DeviceModel, emulate, quantise
+from .process import fit_process, thin
+from .rounding import (
+    BOX,
+    CENTRE_TOP,
+    GAIN_MAX,
+    LENGTH_STEPS,
+    assemble,
+    error_bound_deg,
+    integer_box,
+    integer_centres,
+)
 
 BOX_MARGIN = 0.12  # of a channel's calibrated range, on each side
 BOX_SIGMAS = 6.0  # and at least this many frame-noise deviations
-GUARD_MARGIN = 0.06
-GUARD_SIGMAS = 5.0
+HELD_OUT_MAX, HELD_OUT_LEAST = 2000, 100  # frames to judge a model on
+CLOUD_EACH = 50  # frames of each fixation that the model has to be good at
 TAIL = 5e-4  # quantile taken for the end of the calibrated range
 RIDGES = [1e-8 * 10**i for i in range(7)]  # of a squared kernel value; the first that fits is taken
 POINTS = 4500  # that are fitted to; a third as many are held out
@@ -58,26 +68,42 @@ class DistilReport:
     points: int
 
 
-def distil(gp, features, gaze_deg, n_vectors=64, seed=0, noise=None, points=None, aim_deg=None, say=None):
+def distil(
+    gp,
+    features,
+    gaze_deg,
+    n_vectors=64,
+    seed=0,
+    noise=None,
+    points=None,
+    aim_deg=None,
+    sigma_deg=None,
+    label=None,
+    say=None,
+):
     """Make a DeviceModel from a fitted GaussianProcess.
 
     features    [n, d] frames of the calibration, blinks excluded: their cloud is the range of the model
     gaze_deg    [n, 2] where those frames were looking (used to find neighbours, not as labels)
     n_vectors   how many; with aim_deg at most so many, and the fewest whose rms distance is within aim_deg
     noise       [d] rms of one frame, feature units; default 0;  points: number of inputs to fit to
+    sigma_deg   [n] standard deviation of each angle at those frames; default what the process says
+    label       int [n] their fixations; default each its own
     say(part)   is called with the share of the work that is done
     Returns (DeviceModel, DistilReport); a pure function of its arguments. Raises CalibrationError or
     ModelError.
     """
     features, gaze = np.asarray(features, float), np.asarray(gaze_deg, float)
-    if not 1 <= n_vectors <= VECTORS_MAX:
-        raise ModelError(f"{n_vectors} vectors do not fit the device", f"ask for 1 to {VECTORS_MAX}")
+    choose.most_vectors(None, n_vectors)
     if len(features) < 2 or features.shape[1] > CHANNELS:
         few = f"{len(features)} samples of {features.shape[1:]} channels do not do"
         raise CalibrationError(few, f"give at least 2 samples of at most {CHANNELS} channels")
     order = np.lexsort(np.column_stack([features, gaze]).T)  # the order of the samples must not matter
     noise = np.zeros(features.shape[1]) if noise is None else np.asarray(noise, float)
-    task = _Task(gp, features[order], gaze[order], noise, points or POINTS, seed)
+    sigma_deg = _sigma_deg(gp, features, noise) if sigma_deg is None else np.asarray(sigma_deg, float)
+    label = np.arange(len(features)) if label is None else np.asarray(label)
+    known = features[order], gaze[order], noise, sigma_deg[order], label[order]
+    task = _Task(gp, *known, points or POINTS, seed)
     with threadpool_limits(limits=1, user_api="blas"):  # small matrices; and the sums' order is the answer's
         return task.run(min(n_vectors, max(1, len(task.train) // 4)), aim_deg, say or (lambda part: None))
 
@@ -85,8 +111,8 @@ def distil(gp, features, gaze_deg, n_vectors=64, seed=0, noise=None, points=None
 class _Task:
     """The cloud, in the box; and what is done with it."""
 
-    def __init__(self, gp, features, gaze, noise, points, seed):
-        self.gp, self.features, self.noise = gp, features, noise
+    def __init__(self, gp, features, gaze, noise, sigma_deg, label, points, seed):
+        self.gp, self.features, self.noise, self.sigma_deg, self.label = gp, features, noise, sigma_deg, label
         self.live = np.flatnonzero(np.isfinite(gp.hyper.length))
         low, high = box(features, noise)
         self.middle, self.width = (0.5 * (low + high))[self.live], (high - low)[self.live]
@@ -163,18 +189,20 @@ class _Task:
         for ridge in RIDGES:
             if ridge != expansion.problem.ridge:
                 problem = self._problem(ridge)
-                expansion = type(expansion)(problem, expansion.gains, expansion.centres).improved(POLISH_STEPS)
+                expansion = type(expansion)(problem, expansion.gains, expansion.centres).improved(
+                    POLISH_STEPS
+                )
             offset, gain_q12, centres = self._placed(expansion)
             s, target = self._steps(self.train, offset, gain_q12)
-
-            def trust_of(model):
-                return guards(self.features, offset, gain_q12, self.noise)
-
-            made = assemble(s, target, centres, offset, gain_q12, ridge, trust_of)
+            made = assemble(s, target, centres, offset, gain_q12, ridge, self._trust(offset, gain_q12))
             if made:
                 return made
         none = "no number format holds the weights of this model"
         raise CalibrationError(none, "calibrate again with more targets")
+
+    def _trust(self, offset, gain_q12):
+        gaze = self.gp.predict(self.features)
+        return trustfit.learn(self.features, gaze, self.sigma_deg, offset, gain_q12, self.noise, self.label)
 
     def _placed(self, expansion):
         """offset, gain_q12 [d], centres [n, d] of all channels; zeros where the process dropped one."""
@@ -195,7 +223,8 @@ class _Task:
         return offset, gain_q12, centres
 
     def _steps(self, cloud, offset, gain_q12):
-        """(s, what the process says there). It is asked at the very inputs that the device sees, quantised."""
+        """(s, what the process says there). It is asked at the very inputs that the device sees,
+        quantised."""
         s, _ = quantise(cloud, offset, gain_q12)
         return s, self.gp.predict(unquantise(s, offset, gain_q12, cloud))
 
@@ -204,6 +233,13 @@ class _Task:
         az, el, flags = emulate(model, self.held.astype(np.uint16))
         target = self.gp.predict(self.held)
         return np.hypot(az / 128.0 - target[:, 0], el / 128.0 - target[:, 1]), flags & 4 != 0
+
+
+def _sigma_deg(gp, features, noise):
+    """Standard deviation of each angle of single frames, [n], as the process has it."""
+    _, own = gp.predict(features, return_std=True)
+    through = (gp.gradient(features) * noise) ** 2
+    return np.sqrt(own**2 + gp.hyper.noise_deg**2 + through.sum(axis=(1, 2)) / 2)
 
 
 def box(features, noise):
@@ -248,32 +284,6 @@ def likely_inputs(rng, features, gaze, noise, count):
     return mixed
 
 
-def guards(features, offset, gain, noise):
-    """Bounds along the least principal directions of the calibrated cloud: Trust.
-
-    Blinks and slip leave the cloud in directions in which gaze does not move it, long before a single channel
-    leaves its own range.
-    """
-    s, _ = quantise(np.clip(np.rint(features), 0, 65535), offset, gain)
-    live = np.flatnonzero(gain > 0)
-    step_noise = (noise * gain / 4096.0)[live]
-    _, directions = np.linalg.eigh(np.cov(s[:, live].T).reshape(len(live), len(live)))
-    rows, low, high = [], [], []
-    for direction in directions.T[:GUARDS]:  # least variance first: gaze does not move these
-        direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
-        row = np.zeros(s.shape[1], np.int64)
-        row[live] = np.trunc(63.0 * direction / np.abs(direction).sum())
-        projection = (s >> 4) @ row
-        least, most = np.quantile(projection, [TAIL, 1 - TAIL])
-        spread = float(np.sqrt(row[live] ** 2 @ step_noise**2)) / 16
-        margin = max(GUARD_MARGIN * (most - least), GUARD_SIGMAS * spread)
-        rows.append(row)
-        low.append(int(np.floor(least - margin)))
-        high.append(int(np.ceil(most + margin)))
-    none = np.zeros(len(rows), np.int64)
-    return Trust(np.array(rows), none, np.array(low), np.array(high), np.zeros((2, 2, len(rows)), np.int64), limit=65535)
-
-
 @dataclass(frozen=True)
 class FitResult:
     """What fit_recording made: gp GaussianProcess, model DeviceModel, report FitReport."""
@@ -291,7 +301,11 @@ class FitReport:
     loo_rms_deg, loo_mean_deg  leave-one-fixation-out error of the fixations' means
     lml, condition, jitter  of the process on the means, whose likelihood was maximised
     length [d] feature units, signal_deg, noise_deg; dropped_channels
-    aim_deg  rms distance that chose the number of vectors, or None;  cycles on the Nano;  distil: DistilReport
+    aim_deg  rms distance that chose the number of vectors, or None;  cycles on the Nano
+    held_out_rows, rms_to_gp_deg, max_to_gp_deg  distance of the device's gaze from the full process's on
+    frames that
+    neither process nor model was made from; where there are none (one frame a target), on likely inputs
+    distil: DistilReport
     """
 
     fixations: int
@@ -309,12 +323,16 @@ class FitReport:
     dropped_channels: tuple
     aim_deg: float
     cycles: int
+    held_out_rows: int
+    rms_to_gp_deg: float
+    max_to_gp_deg: float
     distil: DistilReport
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # the matrices are small: threads cost 20 times their gain
 def fit_recording(recording, n_vectors=None, seed=0, kernel="rbf", p=None, budget_cycles=None, progress=None):
-    """Recording -> FitResult. Raises RecordingError, CalibrationError or ModelError; warns of channels it drops
+    """Recording -> FitResult. Raises RecordingError, CalibrationError or ModelError; warns of channels it
+    drops
     and of a recording that hardly depends on its targets.
 
     n_vectors      None chooses: choose.py
@@ -327,10 +345,30 @@ def fit_recording(recording, n_vectors=None, seed=0, kernel="rbf", p=None, budge
     process = fit_process(recording, seed, kernel, p)
     say(0.2)
     aim_deg = None if n_vectors else choose.aim_deg(process.loo_rms_deg, budget_cycles)
-    model, report = distil(
-        process.gp, *process.cloud(), most, seed, process.noise, None, aim_deg, lambda part: say(0.2 + 0.8 * part)
-    )
     fixed, learnt = process.fixed, process.learnt
+    rows = fixed.frames(CLOUD_EACH)
+    features = fixed.features[rows]
+    sigma_deg = trustfit.spread(learnt, process.gp, fixed, rows, process.gp.predict(features))
+    model, report = distil(
+        process.gp,
+        features,
+        fixed.target_deg[rows],
+        most,
+        seed,
+        fixed.noise,
+        None,
+        aim_deg,
+        sigma_deg,
+        fixed.label[rows],
+        lambda part: say(0.2 + 0.8 * part),
+    )
+    unseen = np.setdiff1d(np.arange(len(fixed.features)), np.union1d(rows, process.rows))
+    unseen = fixed.features[thin(unseen, HELD_OUT_MAX)]
+    distance = report.rms_deg, report.max_deg
+    if len(unseen) >= HELD_OUT_LEAST:
+        gaze = np.stack(model.predict(unseen.astype(np.uint16))[:2], axis=1)
+        miss = np.linalg.norm(gaze - process.gp.predict(unseen), axis=1)
+        distance = float(np.sqrt(np.mean(miss**2))), float(miss.max())
     say(1.0)
     return FitResult(
         process.gp,
@@ -351,6 +389,8 @@ def fit_recording(recording, n_vectors=None, seed=0, kernel="rbf", p=None, budge
             learnt.dropped,
             aim_deg,
             choose.cycles(model.vectors),
+            len(unseen) if len(unseen) >= HELD_OUT_LEAST else 0,
+            *distance,
             report,
         ),
     )

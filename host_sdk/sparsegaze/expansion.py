@@ -3,7 +3,8 @@
 
     g(z) = sum_i w_i exp(-|a * z - c_i|^2 / 2) + b . (1, z)        z [d] input, a [d] gains, c_i [d] centres
 
-Variable projection: for given gains and centres the weights are a linear least-squares problem, and what is left
+Variable projection: for given gains and centres the weights are a linear least-squares problem, and what is
+left
 to minimise depends on gains and centres alone (Golub & Pereyra 1973; the Jacobian is Kaufman's, 1975).
 Levenberg-Marquardt needs some 30 steps of it where L-BFGS needs a thousand, and its matrix is cheap: outputs
 share the kernels, so that the normal matrix is the Gram matrix of the kernels' derivatives, projected once,
@@ -31,7 +32,8 @@ class Problem:
 
     ridge      of a squared weight, relative to a squared residual
     gain_range [2, d] least and largest gain
-    floor, top, low   centres lie between max(low, floor * a) and that plus `top`; low is -top / 2 unless given
+    floor, top, low   centres lie between max(low, floor * a) and that plus `top`; low is -top / 2 unless
+    given
     """
 
     z: np.ndarray
@@ -74,7 +76,9 @@ class Expansion:
         self.residual = self.design.T @ self.scaled - problem.target
         self.cost = float(np.sum(self.residual**2) / m + problem.ridge * np.sum(self.scaled**2))
 
-    rms = property(lambda self: self.problem.level * float(np.sqrt(np.mean(np.sum(self.residual**2, axis=1)))))
+    rms = property(
+        lambda self: self.problem.level * float(np.sqrt(np.mean(np.sum(self.residual**2, axis=1))))
+    )
     weights = property(lambda self: self.scaled[: len(self.centres)] * self.problem.level)
 
     def without(self, count):
@@ -118,7 +122,9 @@ class Expansion:
         """Of the kernels in the centres, [d, n, m]; of every output in the log gains, list of [d, m]."""
         n, d = self.centres.shape
         k, weights = self.design[:n], self.scaled[:n]
-        slopes, bends = np.empty((d, n, k.shape[1])), [np.empty((d, k.shape[1])) for _ in range(weights.shape[1])]
+        slopes, bends = np.empty((d, n, k.shape[1])), [
+            np.empty((d, k.shape[1])) for _ in range(weights.shape[1])
+        ]
         for j in range(d):
             gap = self.x[:, j] - self.centres[:, j, None]
             np.multiply(k, gap, out=slopes[j])
@@ -142,7 +148,10 @@ class Expansion:
         gram = _gram(rows) - across.T @ across
         size = d * n
         weight = np.tile(self.scaled[:n], (d, 1))
-        curve, slope = gram[:size, :size] * (weight @ weight.T), self._by_weight(slopes @ self.residual).ravel()
+        curve, slope = (
+            gram[:size, :size] * (weight @ weight.T),
+            self._by_weight(slopes @ self.residual).ravel(),
+        )
         if bends:
             parts = [slice(size + o * d, size + (o + 1) * d) for o in range(len(bends))]
             mixed = sum(weight[:, o, None] * gram[:size, part] for o, part in enumerate(parts))
@@ -178,7 +187,9 @@ class Expansion:
             return ~(held | frozen.T).ravel()
         least, most = self.problem.gain_range
         pull = slope[d * n :]
-        return ~np.r_[held.ravel(), ((self.gains <= least) & (pull > 0)) | ((self.gains >= most) & (pull < 0))]
+        return ~np.r_[
+            held.ravel(), ((self.gains <= least) & (pull > 0)) | ((self.gains >= most) & (pull < 0))
+        ]
 
     def _moved(self, move, frozen):
         n, d = self.centres.shape

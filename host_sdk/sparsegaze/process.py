@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The full Gaussian process of a recording: which frames it sees, what is learnt from what, which to doubt."""
+"""The full Gaussian process of a recording: which frames it sees, what is learnt from what, which to
+doubt."""
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +14,6 @@ MEAN = "constant"
 FRAMES_EACH = 16  # frames of each fixation that the process is given, noise and all
 LENGTH_MAX = 3.0  # standard deviations of a channel: longer ones only ask for huge weights
 ROWS_MAX, LEARN_MAX = 2000, 400  # rows of the final process, and of the one whose likelihood is maximised
-CLOUD_EACH = 50
 OUTLIER_SIGMAS, OUTLIER_ROUNDS = 6.0, 3
 LOO_DOUBTFUL_DEG = 3.0  # twice what people reach with such a headset; gaze at random has about 18
 SINGLE_FRAMES = 2.0  # frames a fixation, below which a frame is a fixation
@@ -22,25 +22,22 @@ LOCAL = 14  # neighbours of a target, for a quadratic through what they see
 
 @dataclass(frozen=True)
 class Process:
-    """A recording's process, and the frames that its device model has to be good at.
+    """A recording's process and what it was learnt from.
 
     gp        the full GaussianProcess;  learnt the one on the fixations' means, whose parameters it has
-    fixed     Fixations without the outliers;  noise [d] rms of a frame, feature units
-    loo_rms_deg, loo_mean_deg  leave-one-fixation-out error; outliers  targets that contradict all others
+    fixed     Fixations without the outliers, with the noise of single frames also where a fixation has but
+    one
+    loo_rms_deg, loo_mean_deg  leave-one-fixation-out error; outliers  targets that contradict all others;
+    rows  frames of fixed in gp
     """
 
     gp: GaussianProcess
     learnt: GaussianProcess
     fixed: Fixations
-    noise: np.ndarray
     loo_rms_deg: float
     loo_mean_deg: float
     outliers: list
-
-    def cloud(self):
-        """(features [n, d], target_deg [n, 2]) of frames all over the calibration."""
-        rows = self.fixed.frames(CLOUD_EACH)
-        return self.fixed.features[rows], self.fixed.target_deg[rows]
+    rows: np.ndarray
 
 
 def fit_process(recording, seed=0, kernel="rbf", p=None):
@@ -51,7 +48,8 @@ def fit_process(recording, seed=0, kernel="rbf", p=None):
     process is then given single frames, with that noise each: the device judges single frames, and a process
     that has only seen means trusts directions that their noise fills. On simulated persons this takes 5 % off
     the error of frames; likelihood on frames, or noise shared within fixations, makes it worse (frames of a
-    fixation agree for free). Where fixations are single frames there is nothing to spread: the process is a plain
+    fixation agree for free). Where fixations are single frames there is nothing to spread: the process is a
+    plain
     one on all of them.
     """
     fixed = fixations(recording)
@@ -96,8 +94,10 @@ def fit_process(recording, seed=0, kernel="rbf", p=None):
             f"targets that are left out are missed by {loo_rms_deg:.1f} deg: this recording says little "
             "about where the eye looked; check the headset's seat and record again, with more targets"
         )
-    gp, noise = learnt, local_noise(fixed.mean, fixed.target) if single else fixed.noise
-    if not single:
+    gp, rows = learnt, np.arange(len(fixed.features))
+    if single:
+        fixed = replace(fixed, noise=local_noise(fixed.mean, fixed.target))
+    else:
         rows = thin(fixed.frames(max(1, min(FRAMES_EACH, ROWS_MAX // len(fixed.mean)))), ROWS_MAX)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -109,7 +109,7 @@ def fit_process(recording, seed=0, kernel="rbf", p=None):
                 kernel=kernel,
                 p=p,
             )
-    return Process(gp, learnt, fixed, noise, loo_rms_deg, float(miss.mean()), lost)
+    return Process(gp, learnt, fixed, loo_rms_deg, float(miss.mean()), lost, rows)
 
 
 def spread_out(fixed, rows, seed):
@@ -137,9 +137,11 @@ def spread_out(fixed, rows, seed):
 
 
 def local_noise(mean, target):
-    """Rms of one reading of every channel, [d], from single readings: what a quadratic in gaze does not explain.
+    """Rms of one reading of every channel, [d], from single readings: what a quadratic in gaze does not
+    explain.
 
-    The quadratic goes through each reading and its neighbours; of the residuals the median counts, so that places
+    The quadratic goes through each reading and its neighbours; of the residuals the median counts, so that
+    places
     where the features bend faster than that do not.
     """
     near = min(LOCAL, len(target))
@@ -153,7 +155,9 @@ def local_noise(mean, target):
         design = np.column_stack([np.ones(near), az, el, az * az, az * el, el * el])
         basis = np.linalg.svd(design, full_matrices=False)
         basis = basis[0][:, basis[1] > 1e-9 * basis[1].max()]
-        share = np.sqrt(max(1.0 - float(np.sum(basis[0] ** 2)), 1e-3))  # of a reading's noise that is left in it
+        share = np.sqrt(
+            max(1.0 - float(np.sum(basis[0] ** 2)), 1e-3)
+        )  # of a reading's noise that is left in it
         left[i] = (mean[i] - basis[0] @ (basis.T @ mean[rows])) / share
     return 1.4826 * np.median(np.abs(left), axis=0)
 

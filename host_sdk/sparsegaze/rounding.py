@@ -29,7 +29,8 @@ OUTPUT_ERROR_DEG = 2.0**-8
 def integer_box(gains, middle, width):
     """Offsets and gain_q12, int64 [d], of inputs z = (feature - middle) / width at gains a.
 
-    The range of the kernel's inputs lies evenly about `middle`, or begins at feature 0 where it would begin below.
+    The range of the kernel's inputs lies evenly about `middle`, or begins at feature 0 where it would begin
+    below.
     """
     gain_q12 = np.clip(np.floor(gains * LENGTH_STEPS * 4096.0 / width), 1, GAIN_MAX).astype(np.int64)
     half = 0.5 * S_MAX * 4096.0 / gain_q12
@@ -39,11 +40,14 @@ def integer_box(gains, middle, width):
 def integer_centres(expansion, s, target, offset, gain_q12, middle, width):
     """Centres [n, d] 0..255 of an expansion whose gains have become offset and gain_q12.
 
-    s [m, d] inputs of the kernel, target [m, 2]. In stages the coordinates nearest to integers are frozen there
+    s [m, d] inputs of the kernel, target [m, 2]. In stages the coordinates nearest to integers are frozen
+    there
     and the rest moves on: with few vectors, rounding all at once costs a tenth of the error.
     """
     unit = 4096.0 * LENGTH_STEPS / gain_q12  # features per length scale
-    centres = np.clip(expansion.centres * width / unit / expansion.gains + (middle - offset) / unit, 0.0, CENTRE_TOP)
+    centres = np.clip(
+        expansion.centres * width / unit / expansion.gains + (middle - offset) / unit, 0.0, CENTRE_TOP
+    )
     one, none = np.ones(len(unit)), np.zeros(len(unit))
     problem = Problem(
         s / LENGTH_STEPS, target, expansion.problem.ridge, np.stack([one, one]), none, CENTRE_TOP, none
@@ -58,12 +62,12 @@ def integer_centres(expansion, s, target, offset, gain_q12, middle, width):
     return np.clip(np.rint(centres * U_STEPS), 0, 255).astype(np.int64)
 
 
-def assemble(s, target, centres, offset, gain_q12, ridge, trust_of):
+def assemble(s, target, centres, offset, gain_q12, ridge, trust):
     """Trend, weights and bias in the device's integers, on the device's own kernel values.
 
     Takes the finest weight format whose weights fit 16 bits and whose sum provably fits 24.
     s [m, d] inputs of the kernel, target [m, 2] deg; ridge of a squared weight per sample, deg^-2
-    trust_of(model) -> trust.Trust for a model that has none yet
+    trust  trust.Trust for inputs of that offset and gain_q12
     Returns (DeviceModel, (proven bound of |gaze| in degrees, what the accumulator holds)), or None when none
     fits.
     """
@@ -71,7 +75,7 @@ def assemble(s, target, centres, offset, gain_q12, ridge, trust_of):
     design = np.hstack([k / 65536.0, s / 4096.0, np.ones((len(s), 1))])
     n, d = len(centres), s.shape[1]
     damped = design.T @ design + np.diag(np.r_[np.full(n, ridge), np.full(d, 1e-9), 0.0]) * len(s)
-    moment, trust = design.T @ target, None
+    moment = design.T @ target
     for bits in reversed(WEIGHT_FRAC_BITS):
         fine, trend_unit = 2.0 ** -(bits + 8), 2.0 ** -(bits + 12)
         unit = np.r_[np.full(n, 2.0**-bits), np.full(d, 4096.0 * trend_unit), trend_unit]
@@ -85,8 +89,6 @@ def assemble(s, target, centres, offset, gain_q12, ridge, trust_of):
         if np.abs(bias).max() > BIAS_MAX:
             continue
         parts = offset, gain_q12, bias, trend, centres, weights, bits
-        if trust is None:
-            trust = trust_of(DeviceModel.from_parts(*parts))
         bound = reach(weights, trend, bias, centres, trust, 0.99 * ACCUMULATOR)
         if bound < ACCUMULATOR:
             return DeviceModel.from_parts(*parts, trust), (float(bound * fine), float(ACCUMULATOR * fine))
@@ -96,7 +98,8 @@ def assemble(s, target, centres, offset, gain_q12, ridge, trust_of):
 def error_bound_deg(model):
     """Bound of the device's arithmetic, degrees: its angle against the same expansion in real numbers.
 
-    The expansion is that of the stored centres, half squares, weights, trend and bias at the same inputs s, plus a
+    The expansion is that of the stored centres, half squares, weights, trend and bias at the same inputs s,
+    plus a
     constant: half of the most that the left-out products of low bytes can come to. Errors: kernels 4 steps of
     2^-16 (sg_gp.h); the left-out products, then within half of their range; floors of one accumulator step;
     rounding of the result to 1/128 deg.

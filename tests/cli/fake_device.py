@@ -43,14 +43,14 @@ def linear_model(generation=1, inverse=None, n_vectors=64):
     )
 
 
-def fit_linear(recording, n_vectors=64):
+def fit_linear(recording, n_vectors=None, **options):
     """What distil.fit_recording does, for linear optics, at once."""
     x = recording.features[recording.valid].astype(float) - MIDDLE
     inverse = np.linalg.lstsq(x, recording.target_deg[recording.valid], rcond=1e-3)[0].T
     miss = x @ inverse.T - recording.target_deg[recording.valid]
     return SimpleNamespace(
         gp=None,
-        model=linear_model(0, inverse, n_vectors),
+        model=linear_model(0, inverse, n_vectors or 64),
         report={"loo_rms_deg": float(np.sqrt((miss**2).sum(axis=1).mean()))},
     )
 
