@@ -54,7 +54,7 @@ def test_small_networks_distilled_from_a_process(widths):
         error, full_error = (np.hypot(*(v - truth).T).mean() for v in (y, full))
         print(f"6-{'-'.join(map(str, widths))}-2, weights of {report.weight_bytes} bytes, {report.n_bytes} "
               f"bytes: rms to the process {rms(y, full):.3f} (float {rms(exact, full):.3f}), to the float "
-              f"network {rms(y, exact):.4f}; mean error to the truth {error:.3f} deg (process {full_error:.3f})")
+              f"network {rms(y, exact):.4f}; error to the truth {error:.3f} deg (process {full_error:.3f})")
         assert rms(y, exact) < limit and rms(y, full) < 1.05 * rms(exact, full) + limit
     assert rms(exact, full) < 0.4
 
