@@ -1,32 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The iris, over rings in the eye's frame: light in and out through the cornea, by Fermat's paths found for a
-// batch of spots at once.
+// The iris, over rows of a disc in the eye's frame: light in and out through the cornea, by Fermat's paths
+// found for a batch of spots at once.
+#include "sim_iris.h"
+
 #include <stdlib.h>
 
-#include "sim_cornea.h"
-
 #define PI 3.14159265358979323846
-// At fineness 1: nodes of a piece of a row, mm between them; where the veil or a lid's edge is in mm per haze
-// and softness; nodes of a piece across the rows, mm between rows.
-static const double NODES_ROW = 3, STEP_ROW = 1.0, STEP_VEIL = 0.4, STEP_EDGE = 0.3;
-static const double NODES_ACROSS = 3, STEP_ACROSS = 0.9;
+// At fineness 1: nodes of a piece across the rows, mm between rows; how many more where rays fold or the face
+// hides some of the eye.
+static const double NODES_ACROSS = 3, STEP_ACROSS = 0.9, UNEVEN = 1.4;
 static const double STEP_FOCUS = 0.8;  // between points, in standard deviations of the narrowest window
-enum { NEWTON_STEPS = 6, PROBE_STEPS = 3 };
+enum { NEWTON_STEPS = 6 };
 
-struct iris {
-    const struct sim_scene *scene;
-    struct sim_light *light;
-    const double *axes, (*sites)[3];  // sites: eye frame
-    const struct sim_lid *lids;
-    int n_lids, folds[2 * SIM_MAX_PORTS];  // whether a site's rays fold
-    int uneven;  // whether any site's do, or the face hides some of the eye from it
-    double *ring, across[2], up[2];
-    struct sim_spots at, probe;
-};
-
-// Where the paths cross the cornea, as the lids see it.
-SIM_WIDE static void locate(const double axes[9], const double place[3], const struct sim_spots *s, int k,
+SIM_WIDE void sim_iris_locate(const double axes[9], const double place[3], const struct sim_spots *s, int k,
                             struct sim_light *light) {
     int n = sim_whole(s->n);
     double *away = light->away + 3 * k * SIM_BATCH, *alpha = light->alpha + k * SIM_BATCH;
@@ -107,7 +94,7 @@ SIM_WIDE static void shade(const double *part, const double *open, int n, double
     SIM_EACH(p, n) shown[p] = part[p] * open[p];
 }
 
-static void flush(struct iris *iris) {
+void sim_iris_flush(struct sim_iris *iris) {
     const struct sim_scene *scene = iris->scene;
     struct sim_light *light = iris->light;
     struct sim_spots *s = &iris->at;
@@ -121,8 +108,8 @@ static void flush(struct iris *iris) {
     for (int k = 0; k < scene->n_sites; ++k) {
         double *transfer = light->transfer + k * SIM_BATCH;
         sim_cornea_refract(&scene->eye, iris->sites[k], NEWTON_STEPS, s, transfer);
-        sim_cornea_mend(&scene->eye, iris->sites[k], iris->folds[k], s, transfer);
-        locate(iris->axes, scene->sites[k].position, s, k, light);
+        sim_cornea_mend(&scene->eye, iris->sites[k], iris->folds[k] > 1, iris->dark[k], s, transfer);
+        sim_iris_locate(iris->axes, scene->sites[k].position, s, k, light);
         if (scene->face.eye_clear[k]) continue;
         const double *alpha = light->alpha + k * SIM_BATCH, *beta = light->beta + k * SIM_BATCH;
         for (int p = 0; p < s->n; ++p)
@@ -145,127 +132,8 @@ static void flush(struct iris *iris) {
     s->n = 0;
 }
 
-// How far a row's samples lie inside what either margin hides from site k, as in the sclera's rows.
-SIM_WIDE static void look(const struct sim_lid *lid, const struct sim_light *light, int k, double *lower,
-                          double *upper, double *full_lower, double *full_upper) {
-    const double *alpha = light->alpha + k * SIM_BATCH, *beta = light->beta + k * SIM_BATCH;
-    const double *rho = light->distance + k * SIM_BATCH;
-    const double *out = light->out + k * SIM_BATCH, *tangent = light->tangent + k * SIM_BATCH;
-    double per_half2 = 1 / (lid->half * lid->half), half = lid->thickness / 2, soft = lid->softness;
-    double tilt = lid->tilt, upper_at = lid->upper, lower_at = lid->lower;
-    SIM_EACH(p, SIM_SAMPLES) {
-        double arch = 1 - alpha[p] * alpha[p] * per_half2, line = tilt * alpha[p], o = out[p], t = tangent[p];
-        double size = sqrt(t * t + 0.01 * o * o);
-        upper[p] = o * rho[p] * (line + upper_at * arch - beta[p]) - half * (size + t);
-        lower[p] = o * rho[p] * (beta[p] - line - lower_at * arch) - half * (size - t);
-        full_upper[p] = upper[p] - o * soft;
-        full_lower[p] = lower[p] - o * soft;
-    }
-}
-
-// Spots along a row, from end to end.
-static void probe_row(struct iris *iris, double chord, double u) {
-    for (int p = 0; p < SIM_SAMPLES; ++p) {
-        double v = chord * (2.0 * p / (SIM_SAMPLES - 1) - 1);
-        iris->probe.x[p] = u * iris->across[0] + v * iris->up[0];
-        iris->probe.y[p] = u * iris->across[1] + v * iris->up[1];
-    }
-    iris->probe.n = SIM_SAMPLES;
-}
-
-// Breaks at the edges of what a site whose rays fold lights of a row. Returns their number.
-static int break_edges(struct iris *iris, int k, double chord, double u, struct sim_breaks *breaks) {
-    const struct sim_eye *eye = &iris->scene->eye;
-    double *transfer = iris->light->transfer, exit[3];
-    int edges = 0;
-    sim_cornea_mend(eye, iris->sites[k], 1, &iris->probe, transfer);
-    for (int p = 0; p + 1 < SIM_SAMPLES; ++p) {
-        if ((transfer[p] > 0) == (transfer[p + 1] > 0)) continue;
-        double from = chord * (2.0 * p / (SIM_SAMPLES - 1) - 1), to = from + 2 * chord / (SIM_SAMPLES - 1);
-        for (int i = 0; i < 30; ++i) {
-            double v = (from + to) / 2, x = u * iris->across[0] + v * iris->up[0];
-            double spot[3] = {x, u * iris->across[1] + v * iris->up[1], eye->iris_z};
-            if ((sim_eye_refract(eye, iris->sites[k], spot, exit) > 0) == (transfer[p] > 0)) from = v;
-            else to = v;
-        }
-        sim_break_add(breaks, from, 1e-4);
-        ++edges;
-    }
-    return edges;
-}
-
-// One row of the disc about the axis: u across, v upward, both in the iris' plane.
-static void add_row(struct iris *iris, double radius, double u, double weight, double step_mm) {
-    const struct sim_scene *scene = iris->scene;
-    const struct sim_eye *eye = &scene->eye;
-    struct sim_light *light = iris->light;
-    struct sim_spots *probe = &iris->probe;
-    double chord = sqrt(radius * radius - u * u), step = 2 * chord / (SIM_SAMPLES - 1);
-    probe_row(iris, chord, u);
-    double from = chord, to = -chord, edge_from = -chord, edge_to = chord;
-    double lower[SIM_SAMPLES], upper[SIM_SAMPLES], full_lower[SIM_SAMPLES], full_upper[SIM_SAMPLES];
-    struct sim_breaks breaks = {2, {-chord, chord}};
-    int edges = 0;
-    for (int i = 0; i < scene->n_sites; ++i) {
-        int k = (int)(light->order[i] - scene->sites);
-        sim_cornea_refract(eye, iris->sites[k], PROBE_STEPS, probe, light->transfer);
-        if (iris->folds[k]) edges += break_edges(iris, k, chord, u, &breaks);
-        locate(iris->axes, scene->sites[k].position, probe, k, light);
-        for (int l = 0; l < iris->n_lids; ++l) {
-            look(&iris->lids[l], light, k, lower, upper, full_lower, full_upper);
-            if (sim_most_of_both(lower, upper) < -0.1 * iris->lids[l].softness) continue;
-            from = fmin(from, -chord + step * sim_crossing(lower, 0, 1));
-            to = fmax(to, -chord + step * sim_crossing(upper, SIM_SAMPLES - 1, -1));
-            edge_from = fmax(edge_from, -chord + step * sim_crossing(full_lower, 0, 1));
-            edge_to = fmin(edge_to, -chord + step * sim_crossing(full_upper, SIM_SAMPLES - 1, -1));
-            if (iris->n_lids > 2) continue;
-            // A site that sets goes behind the far margin once more.
-            sim_break_changes(&breaks, lower, lower, upper, 1, -chord, step);
-            sim_break_changes(&breaks, full_lower, lower, upper, 1, -chord, step);
-            sim_break_changes(&breaks, upper, lower, upper, -1, -chord, step);
-            sim_break_changes(&breaks, full_upper, lower, upper, -1, -chord, step);
-        }
-    }
-    from -= 0.15;  // a little more, for what lies between the samples
-    to += 0.15;
-    if (from >= to) return;
-    double veiled = eye->limbus - eye->haze, clear2 = veiled * veiled - u * u;
-    double clear = clear2 > 0 ? sqrt(clear2) : 0;
-    sim_break_add(&breaks, from, 0.01);
-    sim_break_add(&breaks, to, 0.01);
-    sim_break_add(&breaks, edge_from, 0.1);
-    sim_break_add(&breaks, edge_to, 0.1);
-    if (clear > 0) {
-        sim_break_add(&breaks, -clear, 0.1);
-        sim_break_add(&breaks, clear, 0.1);
-    }
-    for (int i = 0; i + 1 < breaks.n; ++i) {
-        double at = (breaks.at[i] + breaks.at[i + 1]) / 2, length = breaks.at[i + 1] - breaks.at[i];
-        double h = fmin(step_mm, STEP_ROW);
-        if (at < from || at > to) continue;
-        if (fabs(at) > clear) h = fmin(h, STEP_VEIL * eye->haze);
-        if (at < edge_from || at > edge_to) h = fmin(h, STEP_EDGE * iris->lids[0].softness);
-        double want = (edges ? 2 : 1) * (NODES_ROW + length / h);
-        int parts, n = sim_nodes_for(scene->quality.iris * want, &parts);
-        const double *rule = scene->rule[n];
-        double half = length / (2 * parts);
-        for (int j = 0; j < n * parts; ++j) {
-            double t = half * (2 * (j / n) + 1 + rule[j % n]), v = breaks.at[i] + t, stretch = 1;
-            if (edges) {  // an inverse square root at either end becomes smooth
-                v = at - length / 2 * cos(PI * t / length);
-                stretch = PI / 2 * sin(PI * t / length);
-            }
-            int p = iris->at.n++;
-            iris->at.x[p] = u * iris->across[0] + v * iris->up[0];
-            iris->at.y[p] = u * iris->across[1] + v * iris->up[1];
-            iris->at.weight[p] = weight * half * stretch * rule[n + j % n];
-            if (iris->at.n == SIM_BATCH) flush(iris);
-        }
-    }
-}
-
 // Where rows begin and cease to see each site past the first pose of the lids, as t of add_disc().
-static void survey(struct iris *iris, double radius, struct sim_breaks *breaks) {
+static void survey(struct sim_iris *iris, double radius, struct sim_breaks *breaks) {
     const struct sim_scene *scene = iris->scene;
     struct sim_light *light = iris->light;
     int sites = scene->n_sites;
@@ -274,12 +142,10 @@ static void survey(struct iris *iris, double radius, struct sim_breaks *breaks) 
     for (int l = 0; l < iris->n_lids; ++l) {
         for (int i = 0; i < SIM_COLUMNS; ++i) {
             double t = PI / 2 * (2.0 * i / (SIM_COLUMNS - 1) - 1);
-            probe_row(iris, radius * cos(t), radius * sin(t));
             for (int j = 0; j < sites; ++j) {
                 int k = (int)(light->order[j] - scene->sites);
-                sim_cornea_refract(&scene->eye, iris->sites[k], PROBE_STEPS, &iris->probe, light->transfer);
-                locate(iris->axes, scene->sites[k].position, &iris->probe, k, light);
-                look(&iris->lids[l], light, k, value[0], value[1], value[2], value[3]);
+                sim_iris_probe(iris, k, radius, radius * sin(t));
+                sim_iris_look(&iris->lids[l], light, k, value[0], value[1], value[2], value[3]);
                 open[i * sites + j] = sim_most_of_both(value[0], value[1]);
                 full[i * sites + j] = sim_most_of_both(value[2], value[3]);
             }
@@ -292,25 +158,68 @@ static void survey(struct iris *iris, double radius, struct sim_breaks *breaks) 
     }
 }
 
+// What the face does to the row at t, as bits: whether it leaves any of site k's lens anywhere, all of it
+// somewhere, any everywhere, all everywhere.
+static int past_face(struct sim_iris *iris, int k, double radius, double t) {
+    double share[SIM_SAMPLES], most = 0, least = 1;
+    sim_iris_probe(iris, k, radius, radius * sin(t));
+    sim_iris_past_face(iris, k, share);
+    for (int p = 0; p < SIM_SAMPLES; ++p) {
+        if (share[p] < 0) continue;
+        most = fmax(most, share[p]);
+        least = fmin(least, share[p]);
+    }
+    return (most > 0) + 2 * (most >= 1) + 4 * (least > 0) + 8 * (least >= 1);
+}
+
+// Where rows begin and cease to be in the shadow of the face.
+static void survey_shadow(struct sim_iris *iris, double radius, struct sim_breaks *breaks) {
+    const struct sim_scene *scene = iris->scene;
+    for (int j = 0; j < scene->n_sites; ++j) {
+        int k = (int)(iris->light->order[j] - scene->sites), last = 0;
+        if (scene->face.eye_clear[k]) continue;
+        for (int i = 0; i < SIM_COLUMNS; ++i) {
+            double t = PI / 2 * (2.0 * i / (SIM_COLUMNS - 1) - 1), before = t - PI / (SIM_COLUMNS - 1);
+            int now = past_face(iris, k, radius, t);
+            for (int bit = 1; i > 0 && bit < 16; bit *= 2) {
+                double low = before, high = t;
+                if ((last & bit) == (now & bit)) continue;
+                for (int step = 0; step < SIM_SHADOW_STEPS; ++step) {
+                    double middle = (low + high) / 2;
+                    if ((past_face(iris, k, radius, middle) & bit) == (last & bit)) low = middle;
+                    else high = middle;
+                }
+                sim_break_add(breaks, (low + high) / 2, 0.02);
+            }
+            last = now;
+        }
+    }
+}
+
 // The disc within a radius, times a factor. Rows at radius * sin(t) are smooth in t up to their ends.
-static void add_disc(struct iris *iris, double radius, double factor, double step_mm) {
+static void add_disc(struct sim_iris *iris, double radius, double factor, double step_mm) {
     struct sim_breaks breaks = {2, {-PI / 2, PI / 2}};
+    double turn[SIM_EDGE_MOST];
+    for (int i = 0; i < iris->n_edges; ++i)
+        for (int n = sim_edge_turns(&iris->edges[i], iris->across, radius, turn); n--;)
+            if (fabs(turn[n]) < radius) sim_break_add(&breaks, asin(turn[n] / radius), 1e-6);
+    survey_shadow(iris, radius, &breaks);
     survey(iris, radius, &breaks);
     for (int piece = 0; piece + 1 < breaks.n; ++piece) {
         int parts;
         double from = breaks.at[piece], length = breaks.at[piece + 1] - from;
         double step = fmin(step_mm, iris->n_lids > 2 ? 0.6 * STEP_ACROSS : STEP_ACROSS);
-        double want = (iris->uneven ? 3 : 1) * (NODES_ACROSS + radius * length / step);
+        double want = (iris->uneven ? UNEVEN : 1) * (NODES_ACROSS + radius * length / step);
         int n = sim_nodes_for(iris->scene->quality.iris * want, &parts);
         const double *rule = iris->scene->rule[n];
         double half = length / (2 * parts);
         for (int i = 0; i < n * parts; ++i) {
             double t = from + half * (2 * (i / n) + 1 + rule[i % n]);
             double weight = factor * radius * cos(t) * half * rule[n + i % n];
-            add_row(iris, radius, radius * sin(t), weight, step_mm);
+            sim_iris_add_row(iris, radius, radius * sin(t), weight, step_mm);
         }
     }
-    flush(iris);
+    sim_iris_flush(iris);
 }
 
 // The iris of a pupil is the disc within the limbus less that within the pupil: nothing but the domain
@@ -322,9 +231,11 @@ int sim_add_iris(const struct sim_scene *scene, struct sim_light *light, const d
     size_t block = (size_t)(n_lids * scene->n_sensors * scene->n_emitters);
     struct sim_lid lids[SIM_MAX_LIDS];
     double(*sites)[3] = malloc((size_t)scene->n_sites * sizeof *sites), *disc = calloc(block, sizeof *disc);
-    struct iris *iris = malloc(sizeof *iris);
-    if (!disc || !sites || !iris) {
+    struct sim_iris *iris = malloc(sizeof *iris);
+    struct sim_edge *edges = malloc((size_t)scene->n_sites * sizeof *edges);
+    if (!disc || !sites || !iris || !edges) {
         free(disc);
+        free(edges);
         free(sites);
         free(iris);
         return -1;
@@ -339,9 +250,15 @@ int sim_add_iris(const struct sim_scene *scene, struct sim_light *light, const d
     for (int i = 0; i < light->n_foci; ++i) step = fmin(step, STEP_FOCUS * light->foci[i].scale_mm);
     iris->scene = scene;
     iris->uneven = 0;
+    iris->edges = edges;
+    iris->n_edges = 0;
     for (int k = 0; k < scene->n_sites; ++k) {
         iris->folds[k] = sim_cornea_folds(eye, sites[k]);
-        iris->uneven |= iris->folds[k] || !scene->face.eye_clear[k];
+        if (iris->folds[k]) {
+            iris->edge_of[k] = &edges[iris->n_edges++];
+            sim_cornea_edge(eye, sites[k], iris->edge_of[k]);
+        }
+        iris->uneven |= iris->folds[k] > 1 || !scene->face.eye_clear[k];
     }
     iris->light = light;
     iris->axes = axes;
@@ -363,6 +280,7 @@ int sim_add_iris(const struct sim_scene *scene, struct sim_light *light, const d
         add_disc(iris, pupil_mm[p] / 2, -albedo, step);
     }
     free(disc);
+    free(edges);
     free(sites);
     free(iris);
     return 0;

@@ -30,6 +30,7 @@ SOURCES = (
     "sim_sclera.c",
     "sim_cornea.c",
     "sim_iris.c",
+    "sim_iris_row.c",
     "sim_glint.c",
     "sim_glint_mirror.c",
     "sim_scene.c",
