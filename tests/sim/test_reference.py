@@ -152,7 +152,17 @@ def test_scenes_are_the_same_every_time():
 
 @pytest.mark.parametrize(
     "name",
-    ["glint on the limbus", "sensor 5 mm from the eye", "pupil edge at the lid edge", "random 4", "random 8"],
+    [
+        "glint on the limbus",
+        "sensor 5 mm from the eye",
+        "pupil edge at the lid edge",
+        "tangent sensor",
+        "nose between sensor and eye",
+        "random 1",
+        "random 2",
+        "random 4",
+        "random 8",
+    ],
 )
 def test_the_simulator_is_within_the_bar_of_the_reference(name):
     """Shares of the scene's mean total response; the bar is 1e-4 rms and 1e-3 at most."""
