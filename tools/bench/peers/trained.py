@@ -82,12 +82,13 @@ def naive(calibration, held_out, truth_deg, gp_mean_deg):
         choices = [(kind, n, longer, noisier) for longer, noisier in product(LONGER, NOISIER)]
         return c.best(lambda x, y, *choice: fit(x, y, *choice).predict, choices)
 
-    for kind, n in product(("subset", "inducing"), CENTRES):
-        if n <= len(c.features):
-            made.append(candidate(kind, n, *chosen(kind, n)))
+    rows = max(len(x) for x, *_ in c.sets.values())
+    settings = {(kind, n): chosen(kind, n) for kind in ("subset", "inducing") for n in CENTRES if n <= rows}
+    made += [candidate(*of, *found) for of, found in settings.items()]
     bar = EQUAL_ERROR * mean_miss(gp_mean_deg, truth_deg)
-    name, choice = chosen("inducing", min(CENTRES[1], len(c.features)))
-    for n in [n for n in LADDER if n <= max(len(x) for x, *_ in c.sets.values())]:
+    for n in [n for n in LADDER if n <= rows]:
+        near = min((of for of in settings if of[0] == "inducing"), key=lambda of: abs(np.log(of[1] / n)))
+        name, choice = settings[near]
         equal = candidate("inducing", n, name, ("inducing", n, *choice[2:]))
         if mean_miss(equal.predicted, truth_deg) <= bar:
             equal.note += f"; the least N with at most {EQUAL_ERROR} times the full process's error"
