@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write README.md's result tables from what `make demo` and `make bench-sim` measured.
+"""Write README.md's result tables from what `make demo`, `make bench-sim` and `make bench-inference` measured.
 
     python tools/report.py             rewrite the demo's table, between its two markers
     python tools/report.py sim         the simulator's
+    python tools/report.py inference   the inference's
     python tools/report.py --check     exit 1 when the README's table is not what the report says
 """
 import argparse
@@ -64,10 +65,35 @@ def simulator_table(report):
     return "\n".join(lines + [f"| {' | '.join(row)} |" for row in rows])
 
 
+def inference_table(report):
+    """The Markdown table of inference.json: every bar and aim with what was measured, then the peers."""
+    lines = ["| | measured | wanted | met |", "|---|---|---|---|"]
+    for row in report["bars"]:
+        value = "-" if row["value"] is None else figure(row["value"])
+        lines.append(f"| {row['name']} | {value} | {row['kind']} {row['limit']} | {'yes' if row['met'] else '**no**'} |")
+    variance = report.get("variance")
+    if variance:
+        lines.append(f"| errors inside one sigma, inside 1.96 (wanted 0.683 and 0.95) | {variance['coverage68']:.3f}, "
+                     f"{variance['coverage95']:.3f} | - | - |")
+    peers = [row for row in report.get("peers", []) if row["cycles"]]
+    if peers:
+        lines += ["", "| on the same chip and data | data | cycles | flash, B | error to the truth | fits | ours is better in both |",
+                  "|---|---|---|---|---|---|---|"]
+        for row in peers:
+            error = "-" if row["truth_mean_deg"] is None else f"{row['truth_mean_deg']:.2f} deg"
+            better = {True: "yes", False: "**no**", None: "-"}[row.get("dominated")]
+            lines.append(f"| {row['name']} {row['version'] or ''} | {row['dataset']} | {figure(row['cycles'])} | {row['flash']} | {error} | "
+                         f"{'yes' if row['fits'] else 'no'} | {better} |")
+    return "\n".join(lines)
+
+
 SIM_BEGIN = "<!-- simulator: written by tools/report.py from build/bench/sim.json -->"
 SIM_END = "<!-- /simulator -->"
+INFERENCE_BEGIN = "<!-- inference: written by tools/report.py from build/bench/inference.json -->"
+INFERENCE_END = "<!-- /inference -->"
 KINDS = {
     "demo": (Path("build/demo/report.json"), BEGIN, END, table, "make demo"),
+    "inference": (Path("build/bench/inference.json"), INFERENCE_BEGIN, INFERENCE_END, inference_table, "make bench-inference"),
     "sim": (Path("build/bench/sim.json"), SIM_BEGIN, SIM_END, simulator_table, "make bench-sim"),
 }
 
