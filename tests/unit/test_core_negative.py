@@ -18,9 +18,9 @@ FAULTS = {
     "the kernel's end": ("sg_gp_loop.c", "index >= 1536U", "index >= 700U"),
     "the scale of S2": ("sg_gp_loop.c", "squares >> 5", "squares >> 4"),
     "the product of the low bytes": ("sg_gp_loop.c", "* k_q16 - low", "* k_q16"),
-    "the rounding": ("sg_gp.c", "((acc >> 8) + 2) >> 2", "acc >> 10"),
+    "the rounding": ("sg_gp_loop.c", "((acc >> 8) + 2) >> 2", "acc >> 10"),
     "one guard left out": ("sg_gp_loop.c", "i < SG_MODEL_GUARDS", "i + 2 < SG_MODEL_GUARDS"),
-    "a corner of the grid": ("sg_gp.c", "place->share[1] = (uint8_t)(fraction_q7[0] - both)",
+    "a corner of the grid": ("sg_gp_loop.c", "place->share[1] = (uint8_t)(fraction_q7[0] - both)",
                              "place->share[1] = (uint8_t)(fraction_q7[1] - both)"),
     "one table entry": ("sg_gp_table.c", "65535, ", "65000, "),
 }
