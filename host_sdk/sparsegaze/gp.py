@@ -45,8 +45,7 @@ class GaussianProcess:
                has no Cholesky factor. Above 4.5e14 float64 cannot tell it from any larger number
     jitter     relative to its mean diagonal;  dropped channels;  rows_given to fit (n of them kept)
     rounding_deg  bound of a prediction's error by float64, at the data and between them
-    repair     None, or what was done to a matrix that is no covariance: words, smallest_eigenvalue and
-               removed_share (of the sum of |eigenvalues|)
+    repair     None, or what was done to a matrix that is no covariance: words and sizes
     """
 
     x: np.ndarray
@@ -379,8 +378,8 @@ class GaussianProcess:
         part._solve(verify=False)
         mean, std = part.predict(self.x[out], return_std=True)
         miss = np.sqrt(np.mean((mean - self.y[out]) ** 2, axis=1))
-        noise2 = self._repair.noise + self.hyper.noise_deg**2 * self.noise_scale[out] + self.hyper.group_deg**2
-        said = np.sqrt(std**2 + noise2)
+        shared2 = self._repair.noise + self.hyper.group_deg**2
+        said = np.sqrt(std**2 + shared2 + self.hyper.noise_deg**2 * self.noise_scale[out])
         self.repair |= {"held_out_deg": float(np.median(miss)), "claimed_deg": float(np.median(said))}
         if np.median(miss / said) > REPAIR_MISS_MOST:
             raise CalibrationError(

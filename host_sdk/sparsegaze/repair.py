@@ -2,9 +2,10 @@
 """A symmetric matrix of similarities that is no covariance, made into the nearest one that is.
 
 Negative eigenvalues are set to 0 (Higham 1988: the nearest positive semidefinite matrix), and as much as the
-worst of them is added as noise: so far are the others not to be trusted either, and the likelihood, which pays for
-the noise, keeps away from parameters that need much repair. Removal alone missed by 13 deg for samples that it had
-not seen where this misses by 1.4; noise alone leaves one direction almost singular, and missed by 700.
+worst of them is added as noise: so far are the others not to be trusted either, and the likelihood, which
+pays for the noise, keeps away from parameters that need much repair. Removal alone missed by 13 deg for
+samples that it had not seen where this misses by 1.4; noise alone leaves one direction almost singular, and
+missed by 700.
 """
 
 import numpy as np
@@ -14,8 +15,10 @@ RANK_TOLERANCE = 1e-12  # of the largest eigenvalue: smaller ones are removed as
 
 
 class Repair:
-    """matrix [n, n] repaired;  values [r], vectors [n, r] of its range;  least, negative: smallest
-    eigenvalue and number of negative ones before;  share: of the sum of |eigenvalues| that was removed;  noise: variance to add
+    """matrix [n, n] repaired;  values [r], vectors [n, r] of its range;  noise: variance to add to it
+
+    least, negative  smallest eigenvalue and number of negative ones before
+    share            of the sum of |eigenvalues| that was removed
     """
 
     def __init__(self, matrix):
