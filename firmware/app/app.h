@@ -48,8 +48,8 @@ struct app_streams {
     struct sg_gaze gaze;
 };
 
-// Of a request and then its answer, or of a frame's streams, in one place: RAM is short, an answer is made when
-// its request is read, and a frame begins and ends between requests. One instance, in app_requests.c.
+// Of a request and then its answer, or of a frame's streams, in one place: RAM is short, an answer is made
+// when its request is read, and a frame begins and ends between requests. One instance, in app_requests.c.
 union app_body {
     struct sg_hello hello;
     struct sg_status status;

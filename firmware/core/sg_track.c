@@ -19,8 +19,8 @@ uint8_t sg_track_features(const uint16_t code_q2[6], const uint16_t exposure_cyc
     return flags;
 }
 
-// One row of G g, Q7, rounded: at most 2^14. Q9 times Q7 is Q16, high and low byte of the angle apart, as the AVR
-// multiplies: floor((256 a + b) / 512) is floor((a + floor(b / 256)) / 2).
+// One row of G g, Q7, rounded: at most 2^14. Q9 times Q7 is Q16, high and low byte of the angle apart, as the
+// AVR multiplies: floor((256 a + b) / 512) is floor((a + floor(b / 256)) / 2).
 static int16_t gained(const int8_t row_q9[2], const int16_t deg_q7[2])
 {
     int32_t high_q8 = 0, low_q16 = 256;

@@ -24,10 +24,10 @@ uint8_t sg_track_features(const uint16_t code_q2[6], const uint16_t exposure_cyc
 //   feature           6 features, 1/4096 octave
 //   raw_flags         of the sg_raw the features come from; SATURATED, STARVED, EXPOSURE, TRIAL and RECOVERING
 //                     are passed on
-//   recentre          correction of the model's output g, NULL for none: g + offset + floor(G g / 512 + 1/2), G g and the sum
-//                     exact in 32 bits (|G g| <= 2^23), then saturated
-//   out               whole frame, written last: it may lie over `feature`; t_us and infer_us are 0: the caller owns the clock. sigma is that of the model's
-//                     output, uncorrected
+//   recentre          correction of the model's output g, NULL for none: g + offset + floor(G g / 512 + 1/2),
+//                     G g and the sum exact in 32 bits (|G g| <= 2^23), then saturated
+//   out               whole frame, written last: it may lie over `feature`. t_us and infer_us are 0: the
+//                     caller owns the clock. sigma is that of the model's output, uncorrected
 // SG_FLAG_VALID is set only when there is a model and none of OUT_OF_RANGE, SATURATED, STARVED, RECOVERING is
 // set.
 // Returns SG_OK, or SG_E_RANGE when an angle saturated (the frame is then OUT_OF_RANGE and not VALID).

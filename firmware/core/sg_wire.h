@@ -126,8 +126,8 @@ struct sg_mode { uint8_t mode; };
 
 struct sg_infer { uint16_t feature[6]; };
 
-// Correction of a model's output g = (azimuth, elevation):  gaze = g + offset + G g.  Every value is legal: the
-// entries of G are at least -1/4 and below it, so that no correction folds the picture or turns it over.
+// Correction of a model's output g = (azimuth, elevation):  gaze = g + offset + G g.  Every value is legal:
+// the entries of G are at least -1/4 and below 1/4, so no correction folds the picture or turns it over.
 struct sg_affine {
     int16_t offset_deg_q7[2];   // azimuth, elevation
     int8_t gain_q9[4];          // G row by row: azimuth from azimuth, from elevation, elevation from each
@@ -139,7 +139,7 @@ struct sg_gaze {
     int16_t elevation_deg_q7;   // Fick elevation, + up
     uint16_t infer_us;          // last sample to the end of inference, device time; 0 in replies to SG_MSG_INFER
     uint8_t flags;              // bits of enum sg_flag
-    uint8_t sigma_log2_q4;      // standard deviation of the model's output: 2^(code / 16 - 8) deg; 0 unknown, 255 or more
+    uint8_t sigma_log2_q4;      // deviation of the model's output: 2^(code / 16 - 8) deg; 0 unknown, 255 huge
 };
 
 // Everything the gaze of the same seq depends on.
@@ -220,7 +220,8 @@ uint16_t sg_wire_encode_ring(const struct sg_head *head, const void *body, uint8
 
 // Decode one frame, given without its delimiter. body must hold SG_WIRE_BODY_MAX bytes.
 // The frame is used up: its bytes become the packet's.
-// Returns the body's length, or SG_E_SHORT, SG_E_BOUNDS, SG_E_CRC. Never reads or writes out of bounds, whatever comes.
+// Returns the body's length, or SG_E_SHORT, SG_E_BOUNDS, SG_E_CRC. Never reads or writes out of bounds,
+// whatever comes.
 int sg_wire_decode(uint8_t *frame, size_t n, struct sg_head *head, void *body);
 // cdef end
 

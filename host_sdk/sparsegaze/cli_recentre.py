@@ -24,8 +24,8 @@ from .console import Console
 def recentre(port, n_points, clear, distance_mm, width_mm, windowed, as_json):
     """Put a shifted headset right: look at the centre for two seconds, and the gaze there becomes (0, 0).
 
-    With --points 5, say, look at five dots: gaze = g + offset + G g of the model's output g, where G stretches
-    and shears it. Each point is left out in turn to see whether that helps; if it does not, all stays as it
+    With --points 5, say, look at five dots: gaze = g + offset + G g of the model's output g, where G
+    stretches and shears it. Each point is left out in turn to see whether that helps; if it does not, all stays as it
     was ("applied": "none"). Offset and gain are kept in the device until --clear or the next recentre; one
     point leaves the gain alone.
 
@@ -37,7 +37,8 @@ def recentre(port, n_points, clear, distance_mm, width_mm, windowed, as_json):
     from .device import Device
 
     if n_points == 2:
-        raise click.BadParameter("2 points cannot tell a gain from noise: 1, or 3 to 9", param_hint="--points")
+        why = "2 points cannot tell a gain from noise: 1, or 3 to 9"
+        raise click.BadParameter(why, param_hint="--points")
     console = Console(as_json)
     with Device(port) as device:
         if clear:
@@ -61,7 +62,8 @@ def recentre(port, n_points, clear, distance_mm, width_mm, windowed, as_json):
                 report = module.run_points(device, shown, n_points, progress)
     for row in report.points:
         if row["reason"]:
-            console.warn("point %+.0f %+.0f deg is left out: " % row["target_deg"] + row["reason"].split(";")[0])
+            why = row["reason"].split(";")[0]
+            console.warn("point %+.0f %+.0f deg is left out: " % row["target_deg"] + why)
     console.result(report._asdict(), *_recentre_lines(report))
 
 

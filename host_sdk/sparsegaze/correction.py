@@ -14,8 +14,8 @@ import numpy as np
 
 from .wire import GAIN_STEPS_MAX
 
-# What a fixation is off in each axis, a person's own bias and the bend of the slip together, and what a slip of
-# half a millimetre makes of the gain: rms on simulated persons, tools/bench/recentre_slip.py.
+# What a fixation is off in each axis, a person's own bias and the bend of the slip together, and what a slip
+# of half a millimetre makes of the gain: rms on simulated persons, tools/bench/recentre_slip.py.
 POINT_SIGMA_DEG = 0.8
 GAIN_SIGMA = 0.1
 POINTS_LEAST, POINTS_MOST = 3, 9
@@ -45,7 +45,8 @@ class Correction(NamedTuple):
     @property
     def predicted_deg(self):
         """Mean error to expect of what is to be set."""
-        return {"affine": self.affine_error_deg, "offset": self.offset_error_deg}.get(self.kind, self.before_deg)
+        left_out = {"affine": self.affine_error_deg, "offset": self.offset_error_deg}
+        return left_out.get(self.kind, self.before_deg)
 
 
 def undo(gaze_deg, offset_deg, gain):

@@ -93,8 +93,8 @@ def run_points(device, screen, n_points, progress=None):
     good = [row for row in rows if row["gaze_deg"] is not None]
     if len(good) < correction.POINTS_LEAST:
         raise CalibrationError(
-            f"only {len(good)} of {n_points} points had a steady valid gaze ({_reasons(rows)}); the correction "
-            "stays as it was",
+            f"only {len(good)} of {n_points} points had a steady valid gaze ({_reasons(rows)}); the "
+            "correction stays as it was",
             "look at each dot with open eyes; if it goes on, put the headset on anew or calibrate again",
         )
     gaze = np.array([row["gaze_deg"] for row in good])

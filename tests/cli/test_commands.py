@@ -271,7 +271,8 @@ def test_a_stream_from_before_gains_and_sigma_still_replays(command_json, fake, 
     gaze, model = tmp_path / "gaze.csv", tmp_path / "eye.sgm"
     device.model.save(model)
     assert command_json("stream", "PORT", "--seconds", "1", "--csv", gaze)[0] == 0
-    old = [line if line.startswith("#") else ",".join(line.split(",")[:14]) for line in gaze.read_text().splitlines()]
+    lines = gaze.read_text().splitlines()
+    old = [line if line.startswith("#") else ",".join(line.split(",")[:14]) for line in lines]
     gaze.write_text("\n".join(old) + "\n")
     code, data, _ = command_json("replay", gaze, "--model", model)
     assert code == 0 and data["identical"] is True and data["compared"] > 250

@@ -72,7 +72,8 @@ static void fuzz_decode(void)
         const size_t content_bytes = draw(sizeof content + 1);      // sometimes longer than there is room for
         fill(content, content_bytes);
         head = (struct sg_head){ .seq = (uint16_t)draw(65536), .type = (uint8_t)draw(256), .flags = 0 };
-        const int length = sg_wire_encode_ring(&head, content, (uint8_t)content_bytes, whole, sizeof whole, 0) - 1;
+        const int length =
+            sg_wire_encode_ring(&head, content, (uint8_t)content_bytes, whole, sizeof whole, 0) - 1;
         HOLDS(length == (int)content_bytes + 7, "encoded length");
         uint8_t *exact = block((size_t)length);
         memcpy(exact, whole, (size_t)length);

@@ -30,7 +30,7 @@ def flat_model():
 
 
 def host_gaze(model, features, recentre_deg=(0.0, 0.0), gain=None):
-    """[n, 4] integers azimuth, elevation (1/128 deg), flags and sigma's code, as the host's core computes them."""
+    """[n, 4] integers azimuth, elevation (1/128 deg), flags, sigma's code, as the host's core computes them."""
     affine = np.array(tuple(wire.affine(recentre_deg, gain)), replay.AFFINE)
     gazes = replay.infer(model, features, recentre=affine)
     return np.column_stack([*gazes]).astype(np.int32)
@@ -39,7 +39,8 @@ def host_gaze(model, features, recentre_deg=(0.0, 0.0), gain=None):
 def device_gaze(device, features):
     found = device.infer(features)
     sigma = replay.sigma_code(found.sigma_deg)
-    return np.stack([found.azimuth_deg * 128, found.elevation_deg * 128, found.flags, sigma], 1).astype(np.int32)
+    columns = [found.azimuth_deg * 128, found.elevation_deg * 128, found.flags, sigma]
+    return np.stack(columns, 1).astype(np.int32)
 
 
 def test_infer_is_bit_identical_to_the_host_core(board):
@@ -71,7 +72,8 @@ def test_streamed_gaze_is_what_the_host_computes_from_the_raw_frame(board):
     assert {frame.raw.model_crc for frame in frames} == {model.crc}
     for frame in frames:
         raw, gaze = frame.raw, frame.gaze
-        (az, el, flags, sigma), = host_gaze(model, np.array([raw.feature]), raw.recentre.offset_deg, raw.recentre.gain)
+        correction = raw.recentre.offset_deg, raw.recentre.gain
+        (az, el, flags, sigma), = host_gaze(model, np.array([raw.feature]), *correction)
         flags |= raw.flags
         if raw.flags & (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_RECOVERING):
             flags &= ~lib.SG_FLAG_VALID
@@ -249,7 +251,7 @@ def test_every_gain_of_the_wire_is_legal_also_the_most_negative(board):
 
 
 def live_record(version, model_crc, affine, boots):
-    """A copy of the live state in EEPROM as firmware of wire version 1 or 2 lays it out, sequence number 5."""
+    """A copy of the live state in EEPROM as firmware of wire version 1 or 2 has it, sequence number 5."""
     gain = bytes(value & 255 for value in affine.gain_q9) if version == 2 else b""
     payload = (struct.pack("<Ihh", model_crc, *affine.offset_deg_q7) + gain
                + struct.pack("<6HHBB", *[2000] * 6, boots, 0, version) + struct.pack("<H", 5))

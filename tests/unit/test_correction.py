@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The few-point correction: shrinkage, leave-one-out against leaving out, rounding, and when to do nothing."""
+"""The few-point correction: shrinkage, leave-one-out against leaving out, rounding, when to do nothing."""
 import numpy as np
 import pytest
 
@@ -34,7 +34,8 @@ def test_three_points_cannot_vouch_for_a_gain_of_a_tenth():
 
 
 def test_more_points_shrink_less():
-    shrunken = [correction.fit(seen(correction.points(n)), correction.points(n)).gain[0][0] for n in (4, 6, 9)]
+    targets = [correction.points(n) for n in (4, 6, 9)]
+    shrunken = [correction.fit(seen(at), at).gain[0][0] for at in targets]
     assert 0 < shrunken[0] < shrunken[1] < shrunken[2] < 0.105
 
 
@@ -85,7 +86,8 @@ def test_a_headset_that_did_not_slip_is_mostly_left_alone():
     targets, flat = correction.points(5), np.zeros((2, 2))
     found = [correction.fit(seen(targets, flat, np.zeros(2), 0.7, seed), targets) for seed in range(200)]
     left = [fit for fit in found if fit.kind == "none"]
-    assert len(left) > 120 and all(fit.offset_deg == (0.0, 0.0) and fit.gain == ((0, 0), (0, 0)) for fit in left)
+    assert len(left) > 120
+    assert all(fit.offset_deg == (0.0, 0.0) and fit.gain == ((0, 0), (0, 0)) for fit in left)
 
 
 def test_gains_are_steps_of_the_device_and_the_offset_makes_up_for_their_rounding():
@@ -94,13 +96,15 @@ def test_gains_are_steps_of_the_device_and_the_offset_makes_up_for_their_roundin
     found = correction.fit(g, targets)
     steps = np.array(found.gain) * 512
     assert (steps == np.round(steps)).all() and np.abs(steps).max() <= 127
-    assert np.allclose((targets - g - g @ np.array(found.gain).T - found.offset_deg).mean(axis=0), 0, atol=1e-12)
+    left = targets - g - g @ np.array(found.gain).T - found.offset_deg
+    assert np.allclose(left.mean(axis=0), 0, atol=1e-12)
 
 
 def test_a_gain_beyond_what_the_device_holds_stops_at_its_limit():
     targets = correction.points(9)
     found = correction.fit(seen(targets, np.diag([0.9, -0.6])), targets)
-    assert found.gain[0][0] == correction.GAIN_LIMIT == 127 / 512 and found.gain[1][1] == -correction.GAIN_LIMIT
+    assert correction.GAIN_LIMIT == 127 / 512
+    assert (found.gain[0][0], found.gain[1][1]) == (correction.GAIN_LIMIT, -correction.GAIN_LIMIT)
 
 
 def test_undo_is_the_inverse_of_the_correction_also_at_the_limits():

@@ -3,10 +3,10 @@
 
     python tools/bench/recentre_slip.py [--persons 4] [--slips 0.5 1.0] [--out build/bench/recentre.json]
 
-Each person is calibrated as the product does it (120 targets) and judged on held-out targets. Then the headset
-moves by so many mm, in a direction drawn per person, the power is cycled, and the same model is judged again:
-as it is, after `recentre` with one point, and with five. All of it is the shipped firmware on the virtual Nano;
-a slip is another response map. Held-out targets are the same in all runs of a person and none of the points.
+Each person is calibrated as the product does it (120 targets) and judged on held-out targets. Then the
+headset moves by so many mm, in a direction drawn per person, the power is cycled, and the same model is
+judged again: as it is, after `recentre` with one point, and with five. All of it is the shipped firmware on
+the virtual Nano; a slip is another response map. Held-out targets are the same in all runs of a person and none of the points.
 Errors are mean angles to the target per frame, over targets within +-20 deg; loss is what had no valid gaze.
 """
 
@@ -49,7 +49,7 @@ def map_of(seed, slip_mm):
 
 
 def judge(port, seed):
-    """{mean_deg, loss_percent, per_target (target and mean gaze, deg)} of the gaze on the held-out targets."""
+    """{mean_deg, loss_percent, per_target (target, mean gaze; deg)} of the gaze on the held-out targets."""
     done = validate.run(port, HELD_OUT, seed)
     if not done.bit_identical:
         raise SparsegazeError("host and device differ", "this is a bug")
@@ -70,7 +70,7 @@ def corrected(port, seed, n_points):
     except SparsegazeError as error:
         return {"refused": error.message, **judge(port, seed)}
     said = {"applied": done.applied, "predicted_deg": done.predicted_error_deg, "offset_deg": done.after_deg,
-            "gain": done.after_gain, "points": [{k: row[k] for k in ("target_deg", "gaze_deg")} for row in done.points]}
+            "gain": done.after_gain, "points": done.points}
     return {**said, **judge(port, seed)}
 
 
@@ -83,7 +83,8 @@ def of_person(seed, slips_mm, n_points, say):
             with VirtualNano(HEADSET, seed, map=map_of(seed, slip), **options) as nano:
                 if size == 0.0:
                     calibrate.run(nano.port, TARGETS, seed=seed, n_validation=0, folder=Path(folder) / "kept")
-                row = {"person": seed, "slip_mm": size, "direction": slip.tolist(), "before": judge(nano.port, seed)}
+                row = {"person": seed, "slip_mm": size, "direction": slip.tolist()}
+                row["before"] = judge(nano.port, seed)
                 for n in (1, *n_points):
                     row[f"after_{n}"] = corrected(nano.port, seed, n)
                 with Device(nano.port) as device:
@@ -103,7 +104,8 @@ def line(row):
 
 def main():
     """Parse the command line, run, write and print. Returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    formatter = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=formatter)
     parser.add_argument("--persons", type=int, default=4)
     parser.add_argument("--first", type=int, default=FIRST_PERSON)
     parser.add_argument("--slips", type=float, nargs="+", default=[0.5, 1.0], help="mm")
