@@ -105,7 +105,8 @@ def run(wanted, options):
 
 def frontier(folders, ladder, jobs, say):
     """Every data set at every size, in `jobs` processes; the portable loop's cycles; the maps' errors."""
-    wanted = [(place, n) for n in sorted(ladder, key=lambda n: abs(n - DEFAULT_N)) for place in folders]
+    order = [None, *sorted(ladder, key=lambda n: abs(n - DEFAULT_N))]
+    wanted = [(place, n) for n in order for place in folders]
     rows, began = [], time.perf_counter()
     for made in in_turn(wanted, jobs):
         rows.append(made)
@@ -115,6 +116,7 @@ def frontier(folders, ladder, jobs, say):
     for stray in folders[0].parent.glob("avr-*"):
         inference_cycles.remove(stray)
     rows.sort(key=lambda one: (one["kind"], one["dataset"], one["n"]))
+    default, rows = [one for one in rows if one["default"]], [one for one in rows if not one["default"]]
     data = [inference_data.DataSet.load(place) for place in folders]
     stated = [one.key["map_error"] for one in data if one.kind == "simulated"]
     stated = {name: max((error[name] for error in stated), default=None) for name in ("open_rms", "lids_rms")}
@@ -122,6 +124,7 @@ def frontier(folders, ladder, jobs, say):
     cost = portable.run(model_of(fitted(folders[0], data[0], DEFAULT_N)), data[0].held_out.features[:200])
     return {
         "frontier": rows,
+        "default": default,
         "map_error": stated,
         "summary": summary(rows),
         "smallest_n": inference_judge.smallest(rows),
@@ -250,6 +253,12 @@ def tell(report, folder):
                 f"{one['ram']:5} {one['rms_median']:8.4f} {one['rms_worst']:8.4f} {one['ratio_median']:8.4f} "
                 f"{one['ratio_worst']:8.4f} {one['share_flagged']:8.4f}"
             )
+    for one in report.get("default", []):
+        print(
+            f"  default, {one['dataset']:9} n={one['n']:3} {one['cycles']:6} cycles {one['bytes']:5} bytes  "
+            f"rms to GP {one['rms_to_gp_deg'] or 0:.4f}  truth {one['truth_mean_deg'] or 0:.4f} "
+            f"(GP {one['gp64_truth_mean_deg'] or 0:.4f})"
+        )
     for one in report.get("peers", []):
         ours = f"{one['times_ours']:8.1f} times n={one['ours_n']}" if one["times_ours"] else "       -"
         word = {True: "dominated", False: "NOT dominated", None: "did not run"}[one["dominated"]]

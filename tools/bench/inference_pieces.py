@@ -103,7 +103,7 @@ def without_trust(model):
 
 
 def row(folder, n_vectors):
-    """One row of the frontier: a data set (its folder) and a number of vectors."""
+    """One row of the frontier: a data set (its folder) and a number of vectors; None: the product chooses."""
     folder = Path(folder)
     data = inference_data.DataSet.load(folder)
     piece = fitted(folder, data, n_vectors)
@@ -120,7 +120,8 @@ def row(folder, n_vectors):
     found = {
         "dataset": data.name,
         "kind": data.kind,
-        "n": n_vectors,
+        "n": n_vectors or model.vectors,
+        "default": n_vectors is None,
         "cycles": cost["cycles_max"],
         **cost,
         **figures,
