@@ -7,7 +7,7 @@ The faults themselves are gone through in tests/fault; here is what the user rea
 import numpy as np
 import pytest
 from fake_device import MIDDLE, OPTICS, linear_model
-from peers import FakeBoard, Printer, PtyPeer
+from other_ends import FakeBoard, Printer, PtyPeer
 
 from sparsegaze import device as device_module
 from sparsegaze import store
