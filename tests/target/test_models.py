@@ -10,8 +10,10 @@ import pytest
 
 from conftest import collect, exchange, random_features, random_model
 from sparsegaze import replay, wire
+from sparsegaze.device import Device
 from sparsegaze.errors import DeviceError
 from sparsegaze.model import DeviceModel
+from sparsegaze.qemu import QemuBoard
 from sparsegaze.wire import lib
 
 # Of what the host's core and the device both compute; changes only with the arithmetic itself.
@@ -231,11 +233,12 @@ def test_recentre_belongs_to_its_model_and_survives_a_restart(board):
     ((255, -255), None), ((255, 255), [[0.248, 0.248], [0.248, 0.248]]),
     ((-255, 0), [[-0.248, 0.248], [0.248, -0.248]]), ((0, 0), [[1 / 512, 0], [0, -1 / 512]])])
 def test_any_correction_is_bit_identical_and_saturates_instead_of_wrapping(board, offset, gain):
-    model = random_model(64)
+    model, features = random_model(64), random_features(100)
     _, device = board(models={0: model.image})
-    device.recentre(offset, gain)
-    features = random_features(100)
-    np.testing.assert_array_equal(device_gaze(device, features), host_gaze(model, features, offset, gain))
+    with QemuBoard(model.image) as cortex_m4, Device(cortex_m4) as other:
+        for each in (device, other):
+            assert each.recentre(offset, gain).affine == wire.affine(offset, gain)
+            np.testing.assert_array_equal(device_gaze(each, features), host_gaze(model, features, offset, gain))
 
 
 def test_every_gain_of_the_wire_is_legal_also_the_most_negative(board):
