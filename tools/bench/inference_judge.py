@@ -89,9 +89,10 @@ def judge_variance(data, model, gp_deg, gp_std, noise_deg):
 
     gp_deg [n, 2], gp_std [n], noise_deg    the float64 process at every held-out row, and its noise
     Of judged rows with open lids: coverage() of errors to the truth (None when the model gives no sigma) and
-    sorted_error_ratio(); of the process with gp64_ before the names; and with gp64_target_ its errors to the
-    targets, its noise in sigma, which is what it promises. Of all settled frames: shut, half, narrow _frames
-    and _flagged by the lids' opening, blink_flagged, the error of blinks not flagged, false_alarms (open).
+    sorted_error_ratio(); with target_ before the names of errors to the targets, which sigma promises. Of the
+    process the same: gp64_, and gp64_target_ with its noise in sigma. Of settled frames: shut, half, narrow
+    _frames and _flagged by the lids' opening, blink_flagged, the error of blinks not flagged, false_alarms
+    (open lids, flagged).
     """
     device, passed, sigma = answers(data, model)
     truth = data.truth
@@ -102,6 +103,8 @@ def judge_variance(data, model, gp_deg, gp_std, noise_deg):
         error = (device - true)[rows]
         figures = coverage(error, sigma[rows])
         figures["sorted_error_ratio"] = sorted_error_ratio(np.hypot(*error.T), sigma[rows])
+        promised = coverage((device - data.held_out.target_deg)[rows], sigma[rows])
+        figures.update({"target_" + key: value for key, value in promised.items()})
     whole = np.hypot(gp_std, noise_deg)
     target = data.held_out.target_deg
     for name, against, own in (("gp64_", true, gp_std), ("gp64_target_", target, whole)):

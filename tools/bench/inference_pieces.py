@@ -96,12 +96,6 @@ def model_of(piece):
     return DeviceModel(piece["image"])
 
 
-def without_trust(model):
-    """The same DeviceModel without guards, grid and sigma."""
-    parts = model.offset, model.gain_q12, model.bias, model.trend, model.centres, model.weights
-    return type(model).from_parts(*parts, model.weight_frac_bits)
-
-
 def row(folder, n_vectors):
     """One row of the frontier: a data set (its folder) and a number of vectors; None: the product chooses."""
     folder = Path(folder)
