@@ -8,9 +8,9 @@ from .model import HEAD_BYTES, RECORD_BYTES, SLOT_BYTES
 from .trust import NODE_BYTES
 from .trustfit import CELLS_MAX
 
-# Cycles of an inference on the ATmega328P with the assembly loop, as `sparsegaze predict --on nano` counts them,
-# the same for every input: those of a model without vectors, and of a vector. tests/unit/test_fit_choice.py holds
-# them against tests/budget.csv.
+# Cycles of an inference on the ATmega328P with the assembly loop, as `sparsegaze predict --on nano` counts
+# them, the same for every input: those of a model without vectors, and of a vector.
+# tests/unit/test_fit_choice.py holds them against tests/budget.csv.
 CYCLES_BASE, CYCLES_EACH = 2770, 149.5
 MOST = 128  # vectors chosen without being asked for: past this nothing is gained
 ROOM = (SLOT_BYTES - HEAD_BYTES - NODE_BYTES * (CELLS_MAX + 1) ** 2) // RECORD_BYTES  # beside any grid

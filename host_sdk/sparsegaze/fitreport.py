@@ -49,8 +49,8 @@ def lines(summary):
         ),
         (
             "full process",
-            f"{summary['kernel']['kernel']} on {summary['n_full']} rows; misses targets that it was not told by "
-            f"{left_out['mean_deg']:.2f} deg (rms {left_out['rms_deg']:.2f})",
+            f"{summary['kernel']['kernel']} on {summary['n_full']} rows; misses targets it was not told "
+            f"by {left_out['mean_deg']:.2f} deg (rms {left_out['rms_deg']:.2f})",
         ),
         (
             "numerics",

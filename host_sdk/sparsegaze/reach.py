@@ -24,8 +24,8 @@ def reach(weights, trend, bias, centres, trust, enough=0.0):
         |value - value(c)| <= |gradient(c)| . h + h . |curvature(c)| . h / 2 + sqrt(15)/6 |f| |h|^3 / L^3 :
 
     f is a member of the kernel's function space, where |f| = sqrt(w' K w) and every third derivative is at
-    most |f| times the square root of the kernel's sixth, 15 / L^6. Each of the device's kernel values is within
-    KERNEL_ERROR of the exact (sg_gp.h), and of every product less than 256 steps are left out.
+    most |f| times the square root of the kernel's sixth, 15 / L^6. Each of the device's kernel values is
+    within KERNEL_ERROR of the exact (sg_gp.h), and of every product less than 256 steps are left out.
     """
     rows = np.zeros((1, centres.shape[1])) if not trust.guards else trust.row[:, : centres.shape[1]]
     live = np.flatnonzero(np.any(centres, axis=0) | np.any(trend, axis=0) | np.any(rows, axis=0))

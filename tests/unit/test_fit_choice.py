@@ -10,6 +10,7 @@ from test_distil import Eye
 
 from sparsegaze import choose, cli
 from sparsegaze import distil as module
+from sparsegaze.cli_gaze import VECTORS
 from sparsegaze.distil import distil, fit_recording
 from sparsegaze.errors import ModelError
 from sparsegaze.gp import GaussianProcess
@@ -29,7 +30,12 @@ def quick(monkeypatch):
 
 def test_the_cycles_that_are_stated_lie_between_those_of_the_prediction_and_of_the_whole_step():
     budget = read("atmega328p")  # of models with 64 vectors
-    assert budget["sg_gp_predict"]["cycles_max"] <= choose.cycles(64) <= budget["sg_track_infer"]["cycles_max"]
+    least, most = (budget[name]["cycles_max"] for name in ("sg_gp_predict", "sg_track_infer"))
+    assert least <= choose.cycles(64) <= most
+
+
+def test_the_command_line_takes_as_many_vectors_as_a_slot_holds_beside_any_grid():
+    assert VECTORS.max == choose.ROOM
 
 
 @pytest.mark.parametrize("vectors", [1, 24, 100])
