@@ -73,8 +73,8 @@ def inference_table(report):
         lines.append(f"| {row['name']} | {value} | {row['kind']} {row['limit']} | {'yes' if row['met'] else '**no**'} |")
     variance = report.get("variance")
     if variance:
-        lines.append(f"| errors inside one sigma, inside 1.96 (wanted 0.683 and 0.95) | {variance['coverage68']:.3f}, "
-                     f"{variance['coverage95']:.3f} | - | - |")
+        lines.append(f"| errors inside one sigma, inside 1.96 (wanted 0.683 and 0.95) | {variance['coverage68'] or 0:.3f}, "
+                     f"{variance['coverage95'] or 0:.3f} | - | - |")
     peers = [row for row in report.get("peers", []) if row["cycles"]]
     if peers:
         lines += ["", "| on the same chip and data | data | cycles | flash, B | error to the truth | fits | ours is better in both |",
