@@ -33,7 +33,7 @@ from sparsegaze.errors import SparsegazeError
 
 ROOT = Path(__file__).resolve().parents[2]
 SECTIONS = ("frontier", "variance", "identity", "host", "peers", "hard")
-LADDER = (8, 16, 26, 32, 52, 64, 96, 128)  # 26 and 52 are what 7000 and 11,000 cycles pay for
+LADDER = (8, 26, 52, 64, 128)  # 26 and 52 are what 7000 and 11,000 cycles pay for
 QUICK_LADDER = (16, 64)
 PEER_SETS = ("smooth-0", "smooth-1", "smooth-2", "sim-2000", "sim-2001")
 
