@@ -20,10 +20,11 @@ CELL_DEG = 4.0
 CELLS_MAX = 12  # per axis; wider fields get wider cells
 MARGIN_DEG = 2.0
 SMOOTHNESS = 3e-3  # weight of a second difference between nodes, per frame of a cell
+FOLDS = 5
 DRIFT = 4.0
 STEP_SD = 0.29  # of what is rounded to whole steps
-TAIL = 1e-3  # of the calibrated frames may be doubted more than the limit before it is widened
-LIMIT_MARGIN = 1.4
+TAIL = 1e-3  # quantile taken for the ends of what was calibrated
+LIMIT_QUANTILE, LIMIT_MARGIN = 0.95, 1.4  # of doubts by an expectation that has not seen the fixation
 LIMIT_LEAST = 90.0  # squared deviations: pupils go on drifting after the calibration
 RANGE_MARGIN, RANGE_SIGMAS = 0.12, 6.0
 INNER = 0.8  # of the field: what is left out there is interpolated
@@ -76,9 +77,8 @@ def learn(features, gaze_deg, sigma_deg, offset, gain_q12, noise, label=None):
         65535,
         0,
     )
-    gaze_q7 = np.floor(gaze * 128 + 0.5).astype(np.int64)
-    doubt = made.judge(s, gaze_q7, np.zeros(len(s), bool))[1]
-    limit = max(LIMIT_MARGIN * float(np.quantile(doubt, 1 - TAIL)), LIMIT_LEAST * DOUBT_UNIT)
+    doubt = _doubt_of_strangers(blend, nodes, step, row, label)
+    limit = max(LIMIT_MARGIN * float(np.quantile(doubt, LIMIT_QUANTILE)), LIMIT_LEAST * DOUBT_UNIT)
     limit = int(min(np.ceil(limit), 65535))
     gain = int(min(255, np.rint(16 * np.log2(SIGMA_AT_LIMIT) * 4096 / limit)))
     return Trust(
@@ -155,6 +155,23 @@ def _smooth(blend, nodes, values):
     for bend in bends:
         normal = normal + SMOOTHNESS * frames * (bend.T @ bend)
     return splu(sparse.csc_matrix(normal)).solve(blend.T @ values)
+
+
+def _doubt_of_strangers(blend, nodes, step, row, label):
+    """m of every frame [n], by an expectation that has not seen its fixation: as the device will meet new gazes.
+
+    Where targets stand far apart, that is much more than the doubt of frames that the grid was fitted to.
+    """
+    label = np.arange(len(step)) if label is None else np.unique(label, return_inverse=True)[1]
+    doubt = np.zeros(len(step))
+    for fold in range(FOLDS):
+        out = label % FOLDS == fold
+        if out.all() or not out.any():
+            continue
+        surface = _smooth(blend[~out], nodes, step[~out])
+        miss = np.clip(step[out] @ row.T - blend[out] @ (surface @ row.T), -127, 127)
+        doubt[out] = np.sum(miss**2, axis=1)
+    return doubt
 
 
 def _directions(miss, spread, label):
