@@ -93,22 +93,32 @@ static int cut_row(double chord, const double *edges, int n, struct stretch out[
     return parts;
 }
 
-// What a site lights of a row, as far as its edges tell. Returns 0 when that is nothing.
+// Whether a site's rays reach a row at v.
+static int is_lit(const struct sim_iris *iris, int k, double u, double v) {
+    double spot[3] = {u * iris->across[0] + v * iris->up[0], u * iris->across[1] + v * iris->up[1],
+                      iris->scene->eye.iris_z};
+    double exit[3];
+    return sim_eye_refract(&iris->scene->eye, iris->sites[k], spot, exit) > 0;
+}
+
+// What a site lights of a row, as far as its edges tell. Returns 0 when that is nothing. A stretch counts as
+// dark when several places of it are: of what a site beyond 95 degrees lights, edges may be missing.
 static int lit_stretch(struct sim_iris *iris, int k, double chord, double u, const double *edges, int n,
                        struct stretch *out) {
     struct stretch part[SIM_ROW_EDGES + 1];
     int parts = cut_row(chord, edges, n, part), found = 0;
     for (int i = 0; i < parts; ++i) {
-        double v = part[i].from + part[i].length / 2, exit[3];
-        double spot[3] = {u * iris->across[0] + v * iris->up[0], u * iris->across[1] + v * iris->up[1],
-                          iris->scene->eye.iris_z};
-        if (parts > 1 && !(sim_eye_refract(&iris->scene->eye, iris->sites[k], spot, exit) > 0)) {
-            if (iris->n_unlit == SIM_ROW_EDGES) continue;
+        static const double PLACES[] = {0.5, 0.02, 0.98, 0.25, 0.75, 0.1, 0.9};
+        const int most = (int)(sizeof PLACES / sizeof *PLACES);
+        double from = part[i].from, length = part[i].length;
+        int tried = 0;
+        while (parts > 1 && tried < most && !is_lit(iris, k, u, from + PLACES[tried] * length)) ++tried;
+        if (tried == most && iris->n_unlit < SIM_ROW_EDGES) {
             iris->unlit[iris->n_unlit].site = k;
             iris->unlit[iris->n_unlit].from = part[i].from;
             iris->unlit[iris->n_unlit++].to = part[i].from + part[i].length;
-            continue;
         }
+        if (tried) continue;
         if (!found || part[i].length > out->length) *out = part[i];
         found = 1;
     }

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The iris seen by sensors so low that rays through the cornea fold on it: against Snell's law traced forward,
-and against the adaptive reference, finer and finer.
+"""The iris seen by sensors so low that rays through the cornea fold on it: against Snell's law traced
+forward, and against the adaptive reference, finer and finer.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from sparsegaze.scene import Scene, c_person, simulator
 
 
 class Snell:
-    """Rays from one site refracted at a person's cornea, eye frame: an independent writing of the same eye."""
+    """Rays from one site refracted at a person's cornea, eye frame: the same eye, written again."""
 
     def __init__(self, person, site):
         self.radius, self.conic = person.cornea_radius_mm, 1 + person.cornea_asphericity
@@ -26,7 +26,7 @@ class Snell:
         return r2 / (self.radius + np.sqrt(self.radius**2 - self.conic * r2))
 
     def spot(self, x, y):
-        """(where the ray through (x, y) of the cornea meets the iris' plane, cosine of incidence), or None."""
+        """(where the ray through (x, y) of the cornea meets the iris' plane, cosine of incidence) or None."""
         point = np.array([x, y, self.apex - self.sag(x * x + y * y)])
         normal = np.array([x, y, np.sqrt(self.radius**2 - self.conic * (x * x + y * y))])
         normal /= np.linalg.norm(normal)
@@ -80,10 +80,12 @@ def test_every_ordinary_path_is_found(off_axis_deg):
 
 
 @pytest.mark.parametrize(
-    "name", ["nose between sensor and eye", "random 1", "random 21", "random 24", "random 78"]
+    "name", ["nose between sensor and eye", "random 1", "random 21", "random 24", "random 31", "random 78"]
 )
 def test_the_error_falls_steadily_with_fineness(name):
-    """A row beside a caustic that touches it lost all light at once (1e-4 whatever the fineness, up to 8)."""
+    """A row beside a caustic that touches it lost all light at once (1e-4 whatever the fineness, up to 8). In
+    random 31 stretches of rows were dark in their middle, and taken to be dark all along (1.7e-5 throughout).
+    """
     case = next(case for case in random_scenes(90) if case.name == name)
     scale, pairs = mean_total(case), other_pairs(case.headset)
     truth, _, _ = reference_states(
