@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sparsegaze.model import DeviceModel
+from sparsegaze.trust import Trust
 
 REPO = Path(__file__).resolve().parent.parent.parent
 FIRMWARE = REPO / "firmware"
@@ -21,7 +22,7 @@ def make_image(seed, vectors=70, generation=0):
         offset=rng.integers(0, 30000, 6), gain_q12=rng.integers(200, 4000, 6),
         bias=rng.integers(-(1 << 24), 1 << 24, 2), trend=rng.integers(-2000, 2000, (2, 6)),
         centres=rng.integers(0, 256, (vectors, 6)), weights=rng.integers(-3000, 3000, (vectors, 2)),
-        weight_frac_bits=8, generation=generation).image
+        weight_frac_bits=8, generation=generation, trust=Trust(limit=1000 + seed)).image  # every page its own
 
 
 def make_hex(path, data, start=0):

@@ -149,7 +149,7 @@ def test_firmware_of_another_protocol_version_is_named_and_replaced(virtual_nano
     core = tmp_path / "core"
     core.mkdir()
     for path in (FIRMWARE / "core").iterdir():
-        if path.suffix in (".c", ".h", ".S"):
+        if path.suffix in (".c", ".h", ".S") and not path.name.startswith("sg_mlp"):    # as platformio.ini
             (core / path.name).write_text(path.read_text())
     header = (core / "sg_wire.h").read_text()
     old, new = f"SG_WIRE_VERSION = {lib.SG_WIRE_VERSION}", f"SG_WIRE_VERSION = {lib.SG_WIRE_VERSION + 2}"
