@@ -39,6 +39,7 @@ SECTION_INFER, SECTION_FRAME = "0", "5"     # GPIOR0 sections of the firmware: i
 # The demo's bars are about a full model; left alone, calibrate takes the fewest vectors that do, some 25.
 VECTORS = 64
 
+
 def main():
     """Parse the command line, run, report. Returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -90,8 +91,8 @@ def run(options):
             flashed = flash.flash_hex(link, progress=progress)
         say(f"calibrating: {options.targets} targets, in lockstep with the virtual clock")
         began = time.time()
-        calibration = calibrate.run(nano.port, n_targets=options.targets, vectors=VECTORS, seed=seed, n_validation=0, folder=out,
-                                    progress=progress)
+        calibration = calibrate.run(nano.port, n_targets=options.targets, vectors=VECTORS, seed=seed, n_validation=0,
+                                    folder=out, progress=progress)
         calibration_s = time.time() - began
         with Device(nano.port) as device:
             before = model_crc(device)
