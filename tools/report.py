@@ -73,12 +73,25 @@ def inference_table(report):
         lines.append(f"| {row['name']} | {value} | {row['kind']} {row['limit']} | {'yes' if row['met'] else '**no**'} |")
     variance = report.get("variance")
     if variance:
-        lines.append(f"| errors inside one sigma, inside 1.96 (wanted 0.683 and 0.95) | {variance['coverage68'] or 0:.3f}, "
-                     f"{variance['coverage95'] or 0:.3f} | - | - |")
-    peers = [row for row in report.get("peers", []) if row["cycles"]]
+        for name, key in (("target", "target_"), ("true gaze", "")):
+            inside = [variance.get(f"{key}coverage{part}") or 0.0 for part in (68, 95)]
+            lines.append(f"| errors to the {name} inside one sigma, inside 1.96 (0.683 and 0.95 of a Gaussian) | "
+                         f"{inside[0]:.3f}, {inside[1]:.3f} | - | - |")
+        lines.append(f"| frames with shut, half-shut, narrowed lids flagged; false alarms | {variance['shut_flagged']:.3f}, "
+                     f"{variance['half_flagged']:.3f}, {variance['narrow_flagged']:.3f}; {variance['false_alarms']:.3f} | - | - |")
+    defaults = [row for row in report.get("default", []) if row["dataset"].startswith("sim-")]
+    if defaults:
+        n, far = (sorted(row[key] for row in defaults) for key in ("n", "rms_to_gp_deg"))
+        lines.append(f"| default model of {len(n)} persons: vectors, median rms to the GP | {n[0]} to {n[-1]}, {far[len(far) // 2]:.3f} deg | - | - |")
+    shown = ("sim-2000", "smooth-0")    # the file has them all
+    peers = [row for row in report.get("peers", []) if row["cycles"] and row["dataset"] in shown]
     if peers:
         lines += ["", "| on the same chip and data | data | cycles | flash, B | error to the truth | fits | ours is better in both |",
                   "|---|---|---|---|---|---|---|"]
+        for row in report.get("default", []):
+            if row["dataset"] in shown:
+                lines.append(f"| **sparsegaze, {row['n']} vectors** | {row['dataset']} | {figure(row['cycles'])} | {row['flash']} | "
+                             f"{row['truth_mean_deg']:.2f} deg | yes | - |")
         for row in peers:
             error = "-" if row["truth_mean_deg"] is None else f"{row['truth_mean_deg']:.2f} deg"
             better = {True: "yes", False: "**no**", None: "-"}[row.get("dominated")]
