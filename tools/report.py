@@ -73,7 +73,7 @@ def inference_table(report):
         lines.append(f"| {row['name']} | {value} | {row['kind']} {row['limit']} | {'yes' if row['met'] else '**no**'} |")
     variance = report.get("variance")
     if variance:
-        for name, key in (("target", "target_"), ("true gaze", "")):
+        for name, key in (("target", ""), ("true gaze", "truth_")):
             inside = [variance.get(f"{key}coverage{part}") or 0.0 for part in (68, 95)]
             lines.append(f"| errors to the {name} inside one sigma, inside 1.96 (0.683 and 0.95 of a Gaussian) | "
                          f"{inside[0]:.3f}, {inside[1]:.3f} | - | - |")

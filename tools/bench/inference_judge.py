@@ -88,9 +88,9 @@ def judge_variance(data, model, gp_deg, gp_std, noise_deg):
     """What a model knows of what it does not know, on a DataSet: a dict.
 
     gp_deg [n, 2], gp_std [n], noise_deg    the float64 process at every held-out row, and its noise
-    Of judged rows with open lids: coverage() of errors to the truth (None when the model gives no sigma) and
-    sorted_error_ratio(); with target_ before the names of errors to the targets, which sigma promises. Of the
-    process the same: gp64_, and gp64_target_ with its noise in sigma. Of settled frames: shut, half, narrow
+    Of judged rows with open lids: coverage() of errors to the targets, which is what sigma promises (None when
+    the model gives none); with truth_ before the names of errors to the true gaze, and sorted_error_ratio().
+    Of the process the same: gp64_ with its noise in sigma, and gp64_truth_ without. Of settled frames: shut, half, narrow
     _frames and _flagged by the lids' opening, blink_flagged, the error of blinks not flagged, false_alarms
     (open lids, flagged).
     """
@@ -100,14 +100,12 @@ def judge_variance(data, model, gp_deg, gp_std, noise_deg):
     rows = data.held_out.valid & passed & (lids >= OPEN)
     figures = {"coverage68": None, "coverage95": None, "sharpness_deg": None, "error_rms_deg": None}
     if np.isfinite(sigma[rows]).all():
+        figures = coverage((device - data.held_out.target_deg)[rows], sigma[rows])
         error = (device - true)[rows]
-        figures = coverage(error, sigma[rows])
+        figures.update({"truth_" + key: value for key, value in coverage(error, sigma[rows]).items()})
         figures["sorted_error_ratio"] = sorted_error_ratio(np.hypot(*error.T), sigma[rows])
-        promised = coverage((device - data.held_out.target_deg)[rows], sigma[rows])
-        figures.update({"target_" + key: value for key, value in promised.items()})
     whole = np.hypot(gp_std, noise_deg)
-    target = data.held_out.target_deg
-    for name, against, own in (("gp64_", true, gp_std), ("gp64_target_", target, whole)):
+    for name, against, own in (("gp64_", data.held_out.target_deg, whole), ("gp64_truth_", true, gp_std)):
         known = coverage((gp_deg - against)[rows], own[rows])
         figures.update({name + key: value for key, value in known.items()})
     for name, low, high in (("shut", -1.0, 0.3), ("half", 0.3, 0.7), ("narrow", 0.7, BLINK)):

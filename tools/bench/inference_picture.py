@@ -251,10 +251,11 @@ def _knowing(axis, report):
     known = report["variance"]
     names, values, wanted = [], [], []
     for key, words, goal in (
-        ("coverage68", "device: truth within 1 sigma", 0.6827),
-        ("coverage95", "device: truth within 1.96", 0.95),
-        ("gp64_coverage68", "float64 process: within 1 sigma", 0.6827),
-        ("gp64_coverage95", "float64 process: within 1.96", 0.95),
+        ("coverage68", "device: target within 1 sigma", 0.6827),
+        ("coverage95", "device: target within 1.96", 0.95),
+        ("truth_coverage68", "device: true gaze within 1 sigma", 0.6827),
+        ("gp64_coverage68", "float64 process: target within 1", 0.6827),
+        ("gp64_coverage95", "float64 process: target within 1.96", 0.95),
         ("shut_flagged", "shut lids flagged", 1.0),
         ("half_flagged", "half-shut lids flagged", 1.0),
         ("narrow_flagged", "narrowed lids flagged", 1.0),
