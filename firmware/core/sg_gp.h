@@ -18,7 +18,7 @@ enum sg_gp_sigma { SG_GP_SIGMA_UNKNOWN = 0, SG_GP_SIGMA_HUGE = 255 };
 // A gaze and what is known of its error.
 struct sg_gp_point {
     int16_t deg_q7[2];          // azimuth and elevation, Q8.7 (1 LSB = 1/128 deg), rounded half up, saturated
-    uint16_t doubt;             // m: 256 times the squared distance, in standard deviations, from what gaze explains
+    uint16_t doubt;             // m: 256 times the squared distance, in deviations, from what gaze explains
     uint8_t sigma_log2_q4;      // standard deviation of each angle: 2^(code / 16 - 8) deg; enum sg_gp_sigma
     uint8_t flags;              // SG_GP_OUT_OF_RANGE or 0
 };

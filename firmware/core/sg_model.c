@@ -55,7 +55,8 @@ int sg_model_length(const uint8_t *image, uint32_t room, uint8_t space)
     if (vectors < 1 || vectors > SG_MODEL_VECTORS_MAX || grid < 0)
         return SG_E_BOUNDS;
     // at most 256 + 2880 + 234 * 12: 16 bits
-    const uint16_t length = (uint16_t)(SG_MODEL_HEAD_BYTES + (uint16_t)grid + (uint16_t)vectors * SG_MODEL_RECORD_BYTES);
+    const uint16_t records = (uint16_t)((uint16_t)vectors * SG_MODEL_RECORD_BYTES);
+    const uint16_t length = (uint16_t)(SG_MODEL_HEAD_BYTES + (uint16_t)grid + records);
     if (length > SG_MODEL_SLOT_BYTES || sg_rom_u32(image + HEAD(length), space) != length)
         return SG_E_BOUNDS;
     if (length > room)

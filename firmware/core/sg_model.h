@@ -128,8 +128,8 @@ uint32_t sg_model_crc32_at(uint32_t crc, const uint8_t *data, uint16_t n, uint8_
 // the length against vectors, grid, slot (SG_E_BOUNDS) and room (SG_E_SHORT), the CRC (SG_E_CRC), then
 // SG_E_BOUNDS for: channels, kernel, weight_frac_bits, bias, guards, nodes, origin, scale or base outside
 // their ranges; a channel >= d with an offset, gain, trend, guard row entry or centre that is not 0; a guard
-// with low > high or too large a row; a guard not in use, an expectation without guard or a pad byte that is not 0; an offset
-// without gain; a half_c2 that is not that of its centre. sg_gp relies on all of it.
+// with low > high or too large a row; a guard not in use, an expectation without guard or a pad byte that is
+// not 0; an offset without gain; a half_c2 that is not that of its centre. sg_gp relies on all of it.
 // Cost      one pass for the CRC, one over the grid and the records; on AVR about 50 cycles per byte.
 // Returns   SG_OK or one of the errors above.
 int sg_model_open(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space);
