@@ -73,6 +73,8 @@ def lines(summary):
             f"{formats['reach_deg']:.0f} of the {formats['accumulator_deg']:.0f} deg that fit",
         ),
     ]
+    if summary["kernel"]["repair"]:
+        items.insert(2, ("covariance", summary["kernel"]["repair"]["words"]))
     if report["outliers"]:
         told = ", ".join(f"{az:+.1f} {el:+.1f}" for az, el in report["outliers"])
         items.append(("left out", f"targets that contradict all others: {told} deg"))

@@ -134,6 +134,11 @@ def test_fit_for_people_names_what_matters(run, tmp_path):
         assert word in said
 
 
+def test_fit_with_a_measure_that_is_no_covariance_says_so_to_people(run, tmp_path):
+    said = run("-o", tmp_path / "eye.sgm", "--vectors", 4, "--kernel", "minkowski", "--p", 3)[1]
+    assert "gives no covariance in 3 or more channels" in said
+
+
 @pytest.mark.parametrize(
     "args, named",
     [
