@@ -20,9 +20,9 @@ CELL_DEG = 4.0
 CELLS_MAX = 12  # per axis; wider fields get wider cells
 MARGIN_DEG = 2.0
 SMOOTHNESS = 3e-3  # weight of a second difference between nodes, per frame of a cell
-FOLDS = 5
-DRIFT = 4.0
-STEP_SD = 0.29  # of what is rounded to whole steps
+FOLDS = 5  # of fixations, for an expectation that has not seen them
+DRIFT = 4.0  # how often a variance between fixations counts, against one within them
+STEP_SD = 0.29  # steps of s >> 4, of what is rounded to them
 TAIL = 1e-3  # quantile taken for the ends of what was calibrated
 LIMIT_QUANTILE, LIMIT_MARGIN = 0.95, 1.4  # of doubts by an expectation that has not seen the fixation
 LIMIT_LEAST = 90.0  # squared deviations: pupils go on drifting after the calibration
@@ -56,7 +56,7 @@ def learn(features, gaze_deg, sigma_deg, offset, gain_q12, noise, label=None):
     rows = _directions(miss[:, live], spread, label)
     row = np.zeros((len(rows), features.shape[1]), np.int64)
     for i, direction in enumerate(rows):
-        row[i, live] = _whole(direction, miss[:, live], (surface[:, live]))
+        row[i, live] = _whole(direction, surface[:, live])
     projection = (s >> 4) @ row.T
     middle = surface @ row.T
     base = np.clip(np.floor(middle.min(axis=0)), -BASE_MAX, BASE_MAX).astype(np.int64)
@@ -65,7 +65,10 @@ def learn(features, gaze_deg, sigma_deg, offset, gain_q12, noise, label=None):
     margin = np.maximum(RANGE_MARGIN * (high - low), RANGE_SIGMAS * RESIDUAL_SD)
     shape = (nodes[1], nodes[0])
     code = np.clip(np.rint(16 * (sigma + 8)), 1, 240).astype(np.int64).reshape(shape)
-    made = Trust(
+    doubt = _doubt_of_strangers(blend, nodes, step, row, label)
+    limit = max(LIMIT_MARGIN * float(np.quantile(doubt, LIMIT_QUANTILE)), LIMIT_LEAST * DOUBT_UNIT)
+    limit = int(min(np.ceil(limit), 65535))
+    return Trust(
         row,
         base,
         np.floor(low - margin).astype(np.int64),
@@ -74,15 +77,8 @@ def learn(features, gaze_deg, sigma_deg, offset, gain_q12, noise, label=None):
         code,
         origin,
         scale,
-        65535,
-        0,
-    )
-    doubt = _doubt_of_strangers(blend, nodes, step, row, label)
-    limit = max(LIMIT_MARGIN * float(np.quantile(doubt, LIMIT_QUANTILE)), LIMIT_LEAST * DOUBT_UNIT)
-    limit = int(min(np.ceil(limit), 65535))
-    gain = int(min(255, np.rint(16 * np.log2(SIGMA_AT_LIMIT) * 4096 / limit)))
-    return Trust(
-        made.row, made.base, made.low, made.high, made.expected, made.sigma, origin, scale, limit, gain
+        limit,
+        int(min(255, np.rint(16 * np.log2(SIGMA_AT_LIMIT) * 4096 / limit))),
     )
 
 
@@ -194,7 +190,7 @@ def _directions(miss, spread, label):
     return (direction[:, chosen] / np.sqrt(np.maximum(variance[chosen], 1e-6))).T / spread
 
 
-def _whole(direction, miss, surface):
+def _whole(direction, surface):
     """Integers along a direction: a residual of one deviation is RESIDUAL_SD steps, if row and grid hold that."""
     size = RESIDUAL_SD
     size = min(size, ROW_MAX / max(np.abs(direction).sum(), 1e-9))
