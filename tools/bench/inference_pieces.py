@@ -61,9 +61,10 @@ def sources_of(module):
 
 
 def fitted(folder, data, n_vectors):
-    """{image, gp_deg, gp_std, report, seconds} of a data set's fit to so many vectors.
+    """{image, gp_deg, gp_std, spread, report, seconds} of a data set's fit to so many vectors.
 
-    gp_deg [n, 2] and gp_std [n] (at DEFAULT_N only): the float64 process at every held-out row.
+    gp_deg [n, 2] and gp_std [n]: the float64 process at every held-out row; spread (features, gaze_deg): the rows
+    that it was given, moved frames among them. gp_std and spread at DEFAULT_N only.
     """
     words = data.key["hash"], n_vectors, inference_cycles.core_hash()
 
@@ -82,6 +83,7 @@ def fitted(folder, data, n_vectors):
             "gp_deg": mean,
             "gp_std": std,
             "noise_deg": result.gp.hyper.noise_deg,
+            "spread": (result.gp.x, result.gp.y) if n_vectors == DEFAULT_N else None,
             "seconds": seconds,
         }
 
