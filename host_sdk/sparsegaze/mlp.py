@@ -6,12 +6,12 @@ sparsegaze._core. `emulate` states the same arithmetic a second time in numpy in
 header alone, and tests hold the two against each other bit for bit. mlp_train.py makes networks.
 """
 
-import os
 import zlib
 from dataclasses import dataclass
 
 import numpy as np
 
+from . import imagefile
 from .errors import ModelError
 
 MAGIC = 0x4C4D5A47
@@ -108,38 +108,16 @@ class MlpModel:
         body = b"".join(_packed(layer) for layer in layers)
         head["length"] = HEAD.itemsize + len(body)
         image = head.tobytes() + body
-        return cls(image[:4] + zlib.crc32(image[8:]).to_bytes(4, "little") + image[8:])
+        return cls(imagefile.sealed(image))
 
     @classmethod
     def load(cls, path):
         """Read a network file. Raises ModelError, naming the file."""
-        try:
-            with open(path, "rb") as file:
-                image = file.read(LENGTH_MAX + 1)
-        except OSError as error:
-            raise ModelError(f"cannot read {path}: {error.strerror}", "name a network's file") from None
-        try:
-            model = cls(image)
-        except ModelError as error:
-            raise ModelError(f"{path}: {error.message}", error.remedy) from None
-        if len(model.image) != len(image):
-            over = len(image) - len(model.image)
-            raise ModelError(f"{path}: {over} bytes too many behind the network", _REFIT)
-        return model
+        return imagefile.load(cls, path, LENGTH_MAX, "a network's file", _REFIT)
 
     def save(self, path):
         """Write a network file: whole, or not at all. Raises ModelError when the place cannot be written."""
-        part = f"{os.fspath(path)}.{os.getpid()}.part"
-        try:
-            with open(part, "wb") as file:
-                file.write(self.image)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(part, path)
-        except OSError as error:
-            if os.path.exists(part):
-                os.remove(part)
-            raise ModelError(f"cannot write {path}: {error.strerror}", "choose another place") from None
+        imagefile.save(path, self.image)
 
     crc = property(lambda self: int(self._head["crc"]))
     inputs = property(lambda self: int(self._head["inputs"]))

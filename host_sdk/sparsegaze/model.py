@@ -7,12 +7,12 @@ the same arithmetic a second time in numpy integers: the distiller fits weights 
 two against each other bit for bit.
 """
 
-import os
 import zlib
 from typing import NamedTuple
 
 import numpy as np
 
+from . import imagefile
 from .errors import ModelError
 from .fields import put
 from .trust import Trust, grid_bytes, sigma_deg
@@ -139,49 +139,22 @@ class DeviceModel:
         put(records, "c", centres, (n, d))
         put(records, "weight", weights, (n, 2))
         records["half_c2"] = half_squares(centres)
-        return cls(_sealed(head.tobytes() + page + grid + records.tobytes()))
+        return cls(imagefile.sealed(head.tobytes() + page + grid + records.tobytes()))
 
     @classmethod
     def load(cls, path):
         """Read a .sgm file. Raises ModelError, naming the file."""
-        try:
-            with open(path, "rb") as file:
-                image = file.read(SLOT_BYTES + 1)
-        except OSError as error:
-            raise ModelError(
-                f"cannot read {path}: {error.strerror}", "name a model file made by sparsegaze fit"
-            ) from None
-        try:
-            model = cls(image)
-        except ModelError as error:
-            raise ModelError(f"{path}: {error.message}", error.remedy) from None
-        if len(model.image) != len(image):
-            raise ModelError(
-                f"{path}: {len(image) - len(model.image)} bytes too many behind the model", _REFIT
-            )
-        return model
+        return imagefile.load(cls, path, SLOT_BYTES, "a model file made by sparsegaze fit", _REFIT)
 
     def save(self, path):
         """Write a .sgm file: whole, or not at all. Raises ModelError when the place cannot be written."""
-        part = f"{os.fspath(path)}.{os.getpid()}.part"
-        try:
-            with open(part, "wb") as file:
-                file.write(self.image)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(part, path)
-        except OSError as error:
-            if os.path.exists(part):
-                os.remove(part)
-            raise ModelError(
-                f"cannot write {path}: {error.strerror}", "choose another place with -o"
-            ) from None
+        imagefile.save(path, self.image)
 
     def with_generation(self, generation):
         """The same model with another generation number (0..2^32-1) and the CRC that belongs to it."""
         head = np.frombuffer(self.image, HEAD, 1).copy()
         put(head, "generation", generation, ())
-        return DeviceModel(_sealed(head.tobytes() + self.image[PAGE_BYTES:]))
+        return DeviceModel(imagefile.sealed(head.tobytes() + self.image[PAGE_BYTES:]))
 
     crc = property(lambda self: int(self._head["crc"]))
     generation = property(lambda self: int(self._head["generation"]))
@@ -387,7 +360,3 @@ def _checked(image):
     ):
         raise ModelError("the model has fields that this format does not allow", _REFIT)
     return image
-
-
-def _sealed(image):
-    return image[:4] + zlib.crc32(image[8:]).to_bytes(4, "little") + image[8:]

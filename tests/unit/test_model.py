@@ -6,6 +6,7 @@ import zlib
 import numpy as np
 import pytest
 
+from sparsegaze import imagefile
 from sparsegaze import model as m
 from sparsegaze import trust as t
 from sparsegaze._core import ffi, lib
@@ -199,7 +200,7 @@ def test_every_truncation_is_refused(tmp_path):
 def _resealed(image, field, value):
     head = np.frombuffer(image, m.HEAD, 1).copy()
     head[field] = value
-    return m._sealed(head.tobytes() + image[m.PAGE_BYTES :])
+    return imagefile.sealed(head.tobytes() + image[m.PAGE_BYTES :])
 
 
 @pytest.mark.parametrize(
@@ -242,7 +243,7 @@ def test_well_sealed_nonsense_in_the_trust_page_is_refused_here_and_by_the_core(
     image = DeviceModel.from_parts(**parts()).image
     page = np.frombuffer(image, t.PAGE, 1, m.PAGE_BYTES).copy()
     page[field] = value
-    bad = m._sealed(image[: m.PAGE_BYTES] + page.tobytes() + image[m.HEAD_BYTES :])
+    bad = imagefile.sealed(image[: m.PAGE_BYTES] + page.tobytes() + image[m.HEAD_BYTES :])
     with pytest.raises(ModelError):
         DeviceModel(bad)
     assert lib.sg_model_open(ffi.new("struct sg_model_view *"), bad, len(bad), 0) < 0
