@@ -12,17 +12,27 @@
 #include <stdint.h>
 
 #include "hal_port.h"
+#include "sg_light.h"
 #include "sg_wire.h"
 
 enum { HAL_CHANNELS = SG_WIRE_CHANNELS };
 
-// One sensing frame, as measured.
-struct hal_frame {
-    uint32_t t_us;                      // mean of the six mid-exposure times, device time
-    uint16_t span_us;                   // from t_us to the last sample
-    uint16_t seq;                       // low half of the number of frames sensed since boot
-    uint16_t code_q2[HAL_CHANNELS];     // sums of four ADC codes of the one sample, 0..4092
-    uint16_t exposure_cycles[HAL_CHANNELS];   // release to sample, cycles of hal_describe()'s cpu_hz, exact
+// One sensing cycle, as measured: three pairs of sensors, each lit by the other emitters and then unlit.
+struct hal_cycle {
+    uint32_t t_us;                      // mean of the six lit mid-exposure times, device time
+    uint16_t span_us;                   // from t_us to the last sample of the cycle
+    uint16_t seq;                       // low half of the number of cycles sensed since boot
+    struct sg_reading reading;
+};
+
+// How to sense. A frame is `repeats` cycles in a row; frames begin every frame_cycles, dark in between.
+struct hal_timing {
+    uint32_t frame_cycles;              // of hal_describe()'s cpu_hz; 0: cycles without a pause
+    uint16_t period_cycles;             // of one sensing cycle
+    uint8_t repeats;
+    uint8_t wiring;                     // enum sg_wiring
+    uint8_t lights;                     // 0: never lit
+    uint8_t probe;                      // 0..5: the only emitter; 255: as wired
 };
 
 // ----------------------------------------------------------------------------------------------------
@@ -35,19 +45,26 @@ void hal_boot(void);
 // exposure_max_us, page_bytes, board. The rest is left alone.
 void hal_describe(struct sg_hello *hello);
 
-// Start sensing, serial line and watchdog, with these exposures (cycles).
-void hal_start(const uint16_t exposure_cycles[HAL_CHANNELS]);
+// Start sensing, serial line and watchdog, with this timing and these exposures (cycles), both clipped as below.
+// After a reset by the watchdog the lights stay off for a second (hal_report's alarm says so).
+void hal_start(struct hal_timing *timing, uint16_t exposure_cycles[HAL_CHANNELS]);
 
 // One turn of the main loop: delivers what has arrived through the up-calls, moves slow writes on, and feeds
-// the watchdog if, and only if, a new sensing frame has come since it last did. Returns 0 when the port has
+// the watchdog if, and only if, a new sensing cycle has come since it last did. Returns 0 when the port has
 // ended.
 int hal_poll(void);
 
 // Device time, microseconds since boot; wraps after 2^32.
 uint32_t hal_now_us(void);
 
-// Exposures from the next slots on, clipped to the port's limits. Whole: no slot sees half of an exposure.
-void hal_expose(const uint16_t exposure_cycles[HAL_CHANNELS]);
+// Exposures from a cycle soon on, clipped to the port's limits and to what the timing allows, and moved by a few
+// per cent where two releases would collide: `exposure_cycles` is what was taken. Whole: no cycle sees half of it.
+void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS]);
+
+// Timing from a cycle soon on, clipped to what the port can do: `timing` is what was taken.
+void hal_set_timing(struct hal_timing *timing);
+// Longest exposure of a channel under this timing, cycles.
+uint16_t hal_exposure_most(uint8_t channel);
 
 // Encode a packet (sg_wire_encode_ring: n + 8 bytes) into the send queue if at least keep_free bytes of the
 // queue stay free after it. n <= SG_WIRE_BODY_MAX. Returns 1, or 0 if not queued.
@@ -70,15 +87,16 @@ const uint8_t *hal_slot(uint8_t slot);
 uint8_t hal_load(void *record, uint8_t n);
 uint8_t hal_save(const void *record, uint8_t n);
 
-// Fill in the port's counters: frames, late_frames (app_on_frame returned after the next frame was complete,
-// or was never called), late_slots, rx_overrun, stack_free, reset_cause, eeprom_writes.
+// Fill in the port's part: late_frames (app_on_cycle returned after the next cycle was complete, or was never
+// called), late_slots (releases later than the reading can state), rx_overrun, stack_free, reset_cause,
+// eeprom_writes, supply_mv, cycles_max, and its bits of alarm.
 void hal_report(struct sg_status *status);
 
 // ----------------------------------------------------------------------------------------------------
 // Up-calls: the port calls, the application implements.
 
-// A sensing frame is complete. Called at most once per hal_poll(), with the newest.
-void app_on_frame(const struct hal_frame *frame);
+// A sensing cycle is complete. Called at most once per hal_poll(), with the newest; borrowed until it returns.
+void app_on_cycle(const struct hal_cycle *cycle);
 
 // One byte arrived; zero_us is when the latest 0x00 arrived. Called only while one whole reply
 // (SG_WIRE_FRAME_MAX) fits into the send queue: what is not delivered waits, so a request is never dropped

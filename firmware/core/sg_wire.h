@@ -16,7 +16,7 @@
 
 // cdef begin
 enum sg_wire_limits {
-    SG_WIRE_VERSION = 2,
+    SG_WIRE_VERSION = 3,
     SG_WIRE_CHANNELS = 6,       // feature channels in every stream frame; unused ones are 0
     SG_WIRE_HEAD_BYTES = 4,
     SG_WIRE_BODY_MAX = 64,      // largest body, bytes
@@ -42,6 +42,9 @@ enum sg_msg {
     SG_MSG_RECENTRE = 0x0C,     // struct sg_recentre        -> the same, as in force after the request
     SG_MSG_REBOOT = 0x0D,       // struct sg_mode (mode = 0xA5) -> the same, then a watchdog reset
     SG_MSG_BAUD = 0x0E,         // struct sg_mode (mode 0: 1 Mbaud, 1: 500 kbaud) -> the same at the old speed, then the switch; reset restores 1 Mbaud
+    SG_MSG_SETTINGS = 0x0F,     // struct sg_settings        -> the same, as in force after the request
+    SG_MSG_CURVE = 0x10,        // struct sg_curve           -> the same, as in force after the request
+    SG_MSG_PROBE = 0x11,        // struct sg_mode (mode: emitter 0..5) -> struct sg_probe: every sensor by this emitter alone
     SG_MSG_RAW = 0x40,          // stream: struct sg_raw; seq counts sensing frames
     SG_MSG_GAZE = 0x41,         // stream: struct sg_gaze; seq of the raw frame it was computed from
     SG_MSG_COUNTS = 0x42,       // stream: struct sg_counts; the same seq
@@ -61,11 +64,34 @@ enum sg_flag {
     SG_FLAG_SATURATED = 8,      // a channel's exposure ran into the bottom of its range
     SG_FLAG_STARVED = 16,       // a channel collected too little light to say anything
     SG_FLAG_EXPOSURE = 32,      // an exposure changed since the previous frame
-    SG_FLAG_TRIAL = 64,         // computed by the RAM trial model
+    SG_FLAG_FAULT = 64,         // a channel or the board is at fault: sg_status names it
     SG_FLAG_RECOVERING = 128,   // a frame shortly before was out of range: the lids may still be opening
 };
 
-enum sg_exposure_op { SG_EXPOSURE_GET = 0, SG_EXPOSURE_SET = 1, SG_EXPOSURE_AUTO = 2, SG_EXPOSURE_HOLD = 3 };
+enum sg_exposure_op {
+    SG_EXPOSURE_GET = 0,
+    SG_EXPOSURE_SET = 1,        // hold these
+    SG_EXPOSURE_AUTO = 2,
+    SG_EXPOSURE_HOLD = 3,       // hold those in force
+    SG_EXPOSURE_LIMIT = 4,      // automatic exposure stays at or below these
+};
+enum sg_settings_op { SG_SETTINGS_GET = 0, SG_SETTINGS_SET = 1 };
+// What is on the pins: LEDs that sense and emit on A0..A5, or photodiodes on A0..A5 and emitters on D2..D4.
+enum sg_wiring { SG_WIRING_LEDS = 0, SG_WIRING_PHOTODIODES = 1 };
+enum sg_power { SG_POWER_NORMAL = 0, SG_POWER_LOW = 1 };
+// Bits of sg_status.fault[channel].
+enum sg_fault {
+    SG_FAULT_OPEN = 1,          // no current at all, lit or not, at the longest exposure
+    SG_FAULT_SHORT = 2,         // full at the shortest exposure, lit or not
+    SG_FAULT_LOW = 4,           // far less light than in the calibration: covered, or its emitters dead
+    SG_FAULT_HIGH = 8,          // far more light than in the calibration: something lies close before it
+};
+// Bits of sg_status.alarm.
+enum sg_alarm {
+    SG_ALARM_SUPPLY = 1,        // the supply left 4.5 .. 5.5 V, or moved by more than 4 % since boot
+    SG_ALARM_LOCKOUT = 2,       // lights are held off: the watchdog had to reset, and it is not 1 s ago
+    SG_ALARM_LIGHTS_OFF = 4,    // lights are off by command
+};
 enum sg_recentre_op { SG_RECENTRE_GET = 0, SG_RECENTRE_SET = 1, SG_RECENTRE_CLEAR = 2 };
 enum sg_slot { SG_SLOT_A = 0, SG_SLOT_B = 1, SG_SLOT_RAM = 2, SG_SLOT_NONE = 255 };
 enum sg_board { SG_BOARD_TEMPLATE = 0, SG_BOARD_NANO328P = 1, SG_BOARD_MPS2AN386 = 2 };
@@ -74,7 +100,7 @@ enum sg_reset { SG_RESET_POWER = 1, SG_RESET_EXTERNAL = 2, SG_RESET_BROWNOUT = 4
 struct sg_head {
     uint16_t seq;
     uint8_t type;               // enum sg_msg
-    uint8_t flags;              // 0 in version 2; ignored by receivers
+    uint8_t flags;              // 0 in version 3; ignored by receivers
 };
 
 struct sg_hello {
@@ -96,7 +122,7 @@ struct sg_hello {
 struct sg_status {
     uint32_t t_us;              // device time now
     uint32_t frames;            // sensing frames since boot
-    uint16_t exposure_us_q2[6]; // exposure in force per LED, 1/4 us
+    uint16_t exposure_us_q4[6]; // exposure in force per channel, 1/16 us
     uint16_t boot_count;
     uint16_t late_frames;       // frames whose inference or output was not done before the next one
     uint16_t late_slots;        // sensing slots that began late
@@ -113,6 +139,11 @@ struct sg_status {
     uint8_t exposure_auto;      // 1 automatic, 0 held
     uint8_t active;             // enum sg_slot of the model in use
     uint16_t eeprom_writes;     // live-state records written since boot
+    uint16_t supply_mv;         // 0: not measured
+    uint8_t fault[6];           // bits of enum sg_fault per channel
+    uint8_t alarm;              // bits of enum sg_alarm
+    uint8_t reserved;
+    uint16_t cycles_max;        // most cycles between taking a frame's readings and the end of its work, since boot
 };
 
 struct sg_ping { uint32_t token; };
@@ -149,14 +180,16 @@ struct sg_raw {
     struct sg_affine recentre;  // in force
     uint16_t feature[6];        // log2 photocurrent, 1/4096 octave (sg_expose.h)
     uint16_t span_us;           // mean sample time to last sample, device time
-    uint8_t flags;              // SATURATED, STARVED, EXPOSURE, TRIAL, RECOVERING, as in the gaze frame
+    uint8_t flags;              // SATURATED, STARVED, EXPOSURE, FAULT, RECOVERING, as in the gaze frame
     uint8_t reserved;
 };
 
+// Of the last sensing cycle of the frame.
 struct sg_counts {
     uint32_t t_us;
-    uint16_t count_q2[6];       // ADC code, 1/4 LSB
-    uint16_t exposure_us_q2[6];
+    uint16_t lit_code[6];       // ADC code, lights on
+    uint16_t unlit_code[6];     // the same exposure, lights off
+    uint16_t exposure_us_q4[6]; // 1/16 us, the same for both
 };
 
 struct sg_model_info {
@@ -189,8 +222,35 @@ struct sg_model_verdict {
     uint8_t reserved[2];
 };
 
+// A frame is `repeats` sensing cycles, whose photocurrents are averaged; a cycle takes period_us.
+struct sg_settings {
+    uint16_t rate_hz;           // frames a second: wanted, and in the reply as in force; 0: as fast as can be
+    uint16_t rate_limit_hz;     // reply: the most that this model, these streams and these repeats allow
+    uint16_t period_us;         // reply: one sensing cycle, device time
+    uint16_t frame_period_us;   // reply: from frame to frame, device time
+    uint8_t op;                 // enum sg_settings_op
+    uint8_t repeats;            // 1, 2, 4, 8 or 16
+    uint8_t wiring;             // enum sg_wiring
+    uint8_t power;              // enum sg_power
+    uint8_t rolling;            // 1: a gaze after every pair of sensors, three a cycle; needs repeats = 1
+    uint8_t lights;             // 0: off, until set again
+};
+
+// Curvature of each channel's charge over its code: charge = code * (1 + curve * code / 1024), curve in 1/1024.
+struct sg_curve {
+    int8_t curve_q10[6];
+    uint8_t op;                 // enum sg_settings_op
+    uint8_t reserved;
+};
+
+struct sg_probe {
+    uint16_t feature[6];        // log2 photocurrent, 1/4096 octave, 0 where too little came
+    uint8_t emitter;
+    uint8_t reserved;
+};
+
 struct sg_exposure {
-    uint16_t exposure_us_q2[6]; // 1/4 us; clipped to the limits in struct sg_hello
+    uint16_t exposure_us_q4[6]; // 1/16 us; clipped to the limits in struct sg_hello and to the timing's
     uint8_t op;                 // enum sg_exposure_op; the reply's is AUTO or HOLD
     uint8_t reserved;
 };
@@ -227,18 +287,21 @@ int sg_wire_decode(uint8_t *frame, size_t n, struct sg_head *head, void *body);
 
 _Static_assert(sizeof(struct sg_head) == SG_WIRE_HEAD_BYTES, "wire layout");
 _Static_assert(sizeof(struct sg_hello) == 36, "wire layout");
-_Static_assert(sizeof(struct sg_status) == 48, "wire layout");
+_Static_assert(sizeof(struct sg_status) == 60, "wire layout");
 _Static_assert(sizeof(struct sg_pong) == 12, "wire layout");
 _Static_assert(sizeof(struct sg_infer) == 12, "wire layout");
 _Static_assert(sizeof(struct sg_affine) == 8, "wire layout");
 _Static_assert(sizeof(struct sg_gaze) == 12, "wire layout");
 _Static_assert(sizeof(struct sg_raw) == 32, "wire layout");
-_Static_assert(sizeof(struct sg_counts) == 28, "wire layout");
+_Static_assert(sizeof(struct sg_counts) == 40, "wire layout");
 _Static_assert(sizeof(struct sg_model_info) == 36, "wire layout");
 _Static_assert(sizeof(struct sg_model_at) == 4, "wire layout");
 _Static_assert(sizeof(struct sg_model_data) == 52, "wire layout");
 _Static_assert(sizeof(struct sg_model_verdict) == 8, "wire layout");
 _Static_assert(sizeof(struct sg_exposure) == 14, "wire layout");
+_Static_assert(sizeof(struct sg_settings) == 14, "wire layout");
+_Static_assert(sizeof(struct sg_curve) == 8, "wire layout");
+_Static_assert(sizeof(struct sg_probe) == 14, "wire layout");
 _Static_assert(sizeof(struct sg_recentre) == 10, "wire layout");
 _Static_assert(sizeof(struct sg_error) == 2, "wire layout");
 
