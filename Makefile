@@ -29,7 +29,7 @@ quietly = echo "$(1)"; { $(1); } >build/native/log 2>&1 || { cat build/native/lo
 # $(1) over $(2) when it differs, at one stroke because somebody may be reading; then the command $(3).
 refresh = cmp -s $(1) $(2) || { cp $(1) $(2).new && mv $(2).new $(2) && $(if $(3),$(3),:); }
 
-.PHONY: help setup firmware native demo seeds test bench-sim bench-inference check size lock clean distclean
+.PHONY: help setup firmware native demo seeds test bench-sim bench-inference bench-frontend check size lock clean distclean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/  make \1#\2/p' $(MAKEFILE_LIST) | \
@@ -84,6 +84,9 @@ bench-sim: setup native ## the simulator's speed against its error, with peers; 
 bench-inference: setup firmware native ## inference on the device, cycles against error, with peers; ARGS="--quick --no-peers"
 	@sh tools/bench/setup_bench.sh --without-llvm
 	@$(PY) tools/bench/bench_inference.py $(ARGS)
+
+bench-frontend: setup firmware native ## rate, latency, noise, ambient light, eye safety of the front end; ARGS="--quick"
+	@$(PY) tools/bench/bench_frontend.py $(ARGS)
 
 check: firmware ## the quick static checks: includes, licences, packaging, link
 	@$(PY) tests/check_includes.py
