@@ -15,16 +15,17 @@ from . import wire
 from .clock import Clock
 from .errors import DeviceError, NoDeviceError, ProtocolError
 from .exchange import Exchange, refusal
+from .sensing import Sensing
 from .stream import Assembler
 from .transport import open_link
-from .wire import Counts, Exposure, Gaze, Hello, Mode, ModelInfo, Pong, Raw, Recentre, Status, Verdict, lib
+from .wire import Counts, Gaze, Hello, Mode, ModelInfo, Pong, Raw, Recentre, Status, Verdict, lib
 
 SPEEDS = (1_000_000, 500_000)
 BOOT_WAIT_S = 1.7               # the bootloader listens this long; what we said to it would only confuse it
 HELLO_EVERY_S = 0.25
 CONNECT_S = 6.0
 PING_EVERY_S = 1.0
-QUEUE_FRAMES = 4096             # finished frames kept when nobody takes them
+QUEUE_FRAMES = 16384            # finished frames kept when nobody takes them: 16 s at 1 kHz
 
 
 class Frame(NamedTuple):
@@ -47,7 +48,7 @@ class Inference(NamedTuple):
     sigma_deg: np.ndarray       # [n] float64, standard deviation by the model's own account, NaN: unknown
 
 
-class Device:
+class Device(Sensing):
     """Connects on construction; a context manager that turns the stream off on leaving.
 
     port     port name, or an open Link (then not closed by this object)
@@ -238,17 +239,6 @@ class Device:
             raise refusal(verdict.verdict, lib.SG_MSG_TRIAL_USE)
         return verdict
 
-    def exposure(self, us=None, auto=None):
-        """Exposures in force.
-
-        us     six exposures, us, to set and hold;  auto   True: adapt them, False: hold what there is
-        """
-        if us is not None:
-            return self._exposure(lib.SG_EXPOSURE_SET, [int(round(4 * value)) for value in us])
-        if auto is not None:
-            return self._exposure(lib.SG_EXPOSURE_AUTO if auto else lib.SG_EXPOSURE_HOLD)
-        return self._exposure(lib.SG_EXPOSURE_GET)
-
     def recentre(self, offset_deg=None, gain=None, clear=False):
         """Recentre: the correction in force, gaze = g + offset + G g of the model's output g.
 
@@ -345,12 +335,6 @@ class Device:
         return self._exchange.stale
 
     # --------------------------------------------------------------------------------------------------------
-
-    def _exposure(self, op, steps=(0,) * 6):
-        if len(steps) != lib.SG_WIRE_CHANNELS or min(steps) < 0 or max(steps) > 65535:
-            raise ValueError(f"exposures are {lib.SG_WIRE_CHANNELS} values of 0..16383 us")
-        body = wire.body("struct sg_exposure", op=op, exposure_us_q2=list(steps))
-        return self._exchange.request(lib.SG_MSG_EXPOSURE, body, Exposure)
 
     def _greet(self, packet):
         theirs = wire.parse_hello_prefix(packet.body)

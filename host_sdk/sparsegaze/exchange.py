@@ -11,7 +11,7 @@ TRY_TIMEOUTS_S = (0.5, 1.0, 2.0)
 BUSY_WAIT_S = 0.02
 WINDOW = 2                      # requests under way at a time: a longer burst overruns the receiver
 MANY_TRIES = 5                  # of one of many requests: at full rate some meet a busy receiver
-STREAM_KEPT = 3 * 4096          # stream packets kept while nobody takes them
+STREAM_KEPT = 3 * 16384         # stream packets kept while nobody takes them
 
 
 class Exchange:

@@ -30,7 +30,14 @@ ERROR_TEXT = {
     lib.SG_E_BUSY: "an earlier request is under way",
 }
 
-
+FAULT_NAMES = {lib.SG_FAULT_OPEN: "open", lib.SG_FAULT_SHORT: "short", lib.SG_FAULT_LOW: "low",
+               lib.SG_FAULT_HIGH: "high"}
+ALARM_NAMES = {lib.SG_ALARM_SUPPLY: "supply", lib.SG_ALARM_LOCKOUT: "lockout",
+               lib.SG_ALARM_LIGHTS_OFF: "lights-off"}
+EXPOSURE_STEPS_US = 16          # steps of an exposure, a microsecond
+REPEATS = (1, 2, 4, 8, 16)
+WIRINGS = {"leds": lib.SG_WIRING_LEDS, "photodiodes": lib.SG_WIRING_PHOTODIODES}
+POWERS = {"normal": lib.SG_POWER_NORMAL, "low": lib.SG_POWER_LOW}
 GAIN_STEPS_MAX = 127  # of 1/512; -128 is legal on the wire, and left out for symmetry
 
 
@@ -61,7 +68,22 @@ class Status(record("struct sg_status", "Status")):
 
     @property
     def exposure_us(self):
-        return tuple(value / 4 for value in self.exposure_us_q2)
+        return tuple(value / EXPOSURE_STEPS_US for value in self.exposure_us_q4)
+
+    @property
+    def faults(self):
+        """What is wrong with each channel: a tuple of names (values of FAULT_NAMES) for each of the six."""
+        return tuple(_names(FAULT_NAMES, bits) for bits in self.fault)
+
+    @property
+    def alarms(self):
+        """What is wrong with the board: names, values of ALARM_NAMES."""
+        return _names(ALARM_NAMES, self.alarm)
+
+    @property
+    def supply_volts(self):
+        """Supply voltage, V; None where the board cannot measure it."""
+        return self.supply_mv / 1000 if self.supply_mv else None
 
     @property
     def reset_text(self):
@@ -100,11 +122,62 @@ class Exposure(record("struct sg_exposure", "Exposure")):
 
     @property
     def exposure_us(self):
-        return tuple(value / 4 for value in self.exposure_us_q2)
+        return tuple(value / EXPOSURE_STEPS_US for value in self.exposure_us_q4)
 
     @property
     def automatic(self):
         return self.op == lib.SG_EXPOSURE_AUTO
+
+
+class Counts(record("struct sg_counts", "Counts")):
+    """What the converter read in a frame's last sensing cycle; struct sg_counts."""
+
+    __slots__ = ()
+
+    @property
+    def exposure_us(self):
+        return tuple(value / EXPOSURE_STEPS_US for value in self.exposure_us_q4)
+
+
+class Settings(record("struct sg_settings", "Settings")):
+    """How the device senses, as in force; struct sg_settings."""
+
+    __slots__ = ()
+
+    @property
+    def frame_hz(self):
+        """Frames a second of device time."""
+        return 1e6 / self.frame_period_us if self.frame_period_us else 0.0
+
+    @property
+    def wiring_text(self):
+        return _name_of(WIRINGS, self.wiring)
+
+    @property
+    def power_text(self):
+        return _name_of(POWERS, self.power)
+
+
+class Curve(record("struct sg_curve", "Curve")):
+    """Curvature of each channel's charge over its code, in force; struct sg_curve."""
+
+    __slots__ = ()
+
+    @property
+    def curve(self):
+        """charge = code (1 + curve code / 1024), six numbers."""
+        return tuple(value / 1024 for value in self.curve_q10)
+
+
+class Probe(record("struct sg_probe", "Probe")):
+    """Every sensor's light from one emitter alone; struct sg_probe."""
+
+    __slots__ = ()
+
+    @property
+    def octaves(self):
+        """log2 photocurrent of each sensor, octaves; None where too little came."""
+        return tuple(value / 4096 if value else None for value in self.feature)
 
 
 class Affine(record("struct sg_affine", "Affine")):
@@ -140,7 +213,6 @@ class Recentre(record("struct sg_recentre", "Recentre")):
 
 Pong = record("struct sg_pong", "Pong")
 Raw = record("struct sg_raw", "Raw")
-Counts = record("struct sg_counts", "Counts")
 ModelInfo = record("struct sg_model_info", "ModelInfo")
 Verdict = record("struct sg_model_verdict", "Verdict")
 Mode = record("struct sg_mode", "Mode")
@@ -151,6 +223,7 @@ _STRUCT = {Hello: "struct sg_hello", Status: "struct sg_status", Gaze: "struct s
            Raw: "struct sg_raw", Counts: "struct sg_counts", ModelInfo: "struct sg_model_info",
            Mode: "struct sg_mode",
            Verdict: "struct sg_model_verdict", Exposure: "struct sg_exposure", Recentre: "struct sg_recentre",
+           Settings: "struct sg_settings", Curve: "struct sg_curve", Probe: "struct sg_probe",
            ModelAt: "struct sg_model_at"}
 _SIZE = {kind: ffi.sizeof(name) for kind, name in _STRUCT.items()}
 
@@ -270,6 +343,14 @@ def affine(offset_deg, gain=None):
     if steps.shape != (2, 2) or not np.all(np.abs(steps) <= GAIN_STEPS_MAX):
         raise ValueError(f"a recentre gain of {gain} is not inside +-{GAIN_STEPS_MAX / 512:.3f}")
     return Affine(tuple(int(v) for v in offset), tuple(int(v) for v in steps.ravel()))
+
+
+def _names(names, bits):
+    return tuple(name for bit, name in names.items() if bits & bit)
+
+
+def _name_of(names, value):
+    return next((name for name, number in names.items() if number == value), f"unknown ({value})")
 
 
 def _plain(value):
