@@ -41,7 +41,7 @@ import numpy as np
 sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "host_sdk"))
 
 from sparsegaze.gp import GaussianProcess  # noqa: E402
-from sparsegaze.headset import Headset, load_headset  # noqa: E402
+from sparsegaze.headset import load_headset  # noqa: E402
 from sparsegaze.person import draw_person  # noqa: E402
 from sparsegaze.scene import Scene  # noqa: E402
 from sparsegaze.simulate import REFERENCE_MEAN  # noqa: E402
@@ -63,13 +63,6 @@ FEATURE_STEPS = 4096  # per octave, as the device sends
 QUICK = {"sclera": 0.5, "iris": 0.55, "face": 0.4, "glint": 0.9}
 
 
-def channels(response):
-    """What each sensor collects with all other emitters lit."""
-    if response.shape[-1] == response.shape[-2]:
-        response = response * (1 - np.eye(response.shape[-1]))
-    return response.sum(-1)
-
-
 def noise(signal):
     """Relative rms noise of one frame in channels of this response (any shape; response units, > 0)."""
     current = NOMINAL_NA * np.asarray(signal) / REFERENCE_MEAN
@@ -78,12 +71,13 @@ def noise(signal):
 
 def precision_deg(scene, step_deg=5.0, half_deg=20.0):
     """Radial rms of the best possible estimate of gaze from one frame, averaged over a grid."""
+    collect = scene.headset.collect
     grid, h, errors = np.arange(-half_deg, half_deg + 0.1, step_deg), 0.5, []
     for elevation in grid:
         for azimuth in grid:
 
             def at(d_az, d_el, d_pupil):
-                return np.log(channels(scene.response(azimuth + d_az, elevation + d_el, PUPIL_MM + d_pupil)))
+                return np.log(collect(scene.response(azimuth + d_az, elevation + d_el, PUPIL_MM + d_pupil)))
 
             slopes = [(at(*(h * e)) - at(*(-h * e))) / (2 * h) for e in np.eye(3)]
             slopes = np.array(slopes) / noise(np.exp(at(0, 0, 0)))
@@ -95,13 +89,14 @@ def precision_deg(scene, step_deg=5.0, half_deg=20.0):
 
 def learned_deg(scene, seed, n_validation=25):
     """(mean angle to target, to true gaze, 95th percentile to true gaze) of a calibrated process; degrees."""
+    collect = scene.headset.collect
     rng = np.random.default_rng([seed, 0x91ACE])
     pupil = float(np.clip(PUPIL_MM + PUPIL_BETWEEN_MM * rng.normal(), 2.4, 5.5))
 
     def look(targets, frames):
         true = targets + rng.normal(0, BIAS_DEG, targets.shape)
         signal = np.array(
-            [channels(scene.response(az, el, pupil + PUPIL_WITHIN_MM * rng.normal())) for az, el in true]
+            [collect(scene.response(az, el, pupil + PUPIL_WITHIN_MM * rng.normal())) for az, el in true]
         )
         error = noise(signal) / np.sqrt(frames) * rng.normal(size=signal.shape)
         return FEATURE_STEPS * np.log2(signal * (1 + error)), true
@@ -124,10 +119,11 @@ def learned_deg(scene, seed, n_validation=25):
 
 def light_na(scene, step_deg=5.0, half_deg=20.0):
     """Photocurrent of each sensor, nominal pupil, nA: mean over gaze by the trapezoidal rule."""
+    collect = scene.headset.collect
     grid = np.arange(-half_deg, half_deg + 0.1, step_deg)
     weight = np.ones(len(grid))
     weight[[0, -1]] = 0.5
-    seen = [channels(scene.response(azimuth, elevation, PUPIL_MM)) for azimuth in grid for elevation in grid]
+    seen = [collect(scene.response(azimuth, elevation, PUPIL_MM)) for azimuth in grid for elevation in grid]
     return NOMINAL_NA * np.average(seen, axis=0, weights=np.outer(weight, weight).ravel()) / REFERENCE_MEAN
 
 
@@ -166,7 +162,7 @@ def turned(headset, k, aim_mm):
     aim = np.subtract(aim_mm, old.position_mm)
     led = dataclasses.replace(old, aim=tuple(float(v) for v in aim / np.linalg.norm(aim)))
     ports = tuple(led if i == k else p for i, p in enumerate(headset.sensors))
-    return Headset(headset.name, ports, ports, headset.board, headset.wiring)
+    return dataclasses.replace(headset, sensors=ports, emitters=ports)
 
 
 def aim_point(port, z_mm=-11.0):

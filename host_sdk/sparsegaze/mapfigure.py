@@ -69,9 +69,10 @@ def save_figure(made, path, state=0):
 
 
 def _title(made, state, sweep):
-    names = "%s: what each sensor receives %s, all other emitters lit" % (
+    names = "%s: what each sensor receives %s, %s lit" % (
         made.headset.get("name", "headset"),
         "along one line of gaze" if sweep else "over gaze",
+        "its phase's emitters" if made.headset.get("phases") else "all other emitters",
     )
     slip = made.slip_mm[state]
     moved = ", slip %g, %g, %g mm" % tuple(slip) if slip.any() else ""
@@ -115,7 +116,7 @@ def draw_map(cell, made, sensor, state=0):
 
 def draw_place(panel, made, sensor, state=0):
     """The headset before the eye, as its wearer sees it: eye, lids, every sensor and emitter; one sensor
-    marked, with an arrow to what it looks at.
+    marked, with an arrow to what it looks at, and who is lit for it in amber.
     """
     person = made.person
     panel.set_aspect("equal")
@@ -123,10 +124,12 @@ def draw_place(panel, made, sensor, state=0):
     eye, slip = np.array(person["eye_position_mm"]), made.slip_mm[state]
     _eye(panel, person, made.pupil_mm[state], made.lid_opening[state], eye)
     sensors, emitters = made.headset["sensors"], made.headset["emitters"]
-    shown = {tuple(p["position_mm"]): p for p in list(emitters) + list(sensors)}
-    for position in shown:
+    shown = {tuple(p["position_mm"]): False for p in sensors}
+    for p, lit in zip(emitters, made.lit[sensor]):
+        shown[tuple(p["position_mm"])] = lit
+    for position, lit in shown.items():
         x, y = np.add(position, slip)[:2]
-        panel.plot(x, y, "o", color="white", markeredgecolor=FAINT, markersize=6, zorder=3)
+        panel.plot(x, y, "o", color=COLOURS["glint"] if lit else "white", markeredgecolor=FAINT, markersize=6, zorder=3)
     port = sensors[sensor]
     start, aim = np.add(port["position_mm"], slip), np.array(port["aim"])
     # to the plane of the cornea

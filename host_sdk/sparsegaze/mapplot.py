@@ -10,9 +10,17 @@ PANEL_STEP_DEG = 0.25
 
 
 def sensor_maps(
-    path, pupil_mm=PUPIL_NOMINAL_MM, lid_opening=1.0, half_deg=PANEL_HALF_DEG, step_deg=PANEL_STEP_DEG
+    path,
+    headset,
+    pupil_mm=PUPIL_NOMINAL_MM,
+    lid_opening=1.0,
+    half_deg=PANEL_HALF_DEG,
+    step_deg=PANEL_STEP_DEG,
 ):
-    """What each sensor collects with all other emitters lit: (degrees [n], response [sensor, el, az])."""
+    """What each sensor collects with its emitters lit: (degrees [n], response [sensor, el, az]).
+
+    path, headset   of a map file, and the Headset that it was made of
+    """
     degrees = np.arange(-half_deg, half_deg + step_deg / 2, step_deg)
     elevation, azimuth = np.meshgrid(degrees, degrees, indexing="ij")
     states = np.column_stack(
@@ -24,10 +32,8 @@ def sensor_maps(
         ]
     )
     with ResponseMap(path) as opened:
-        response = opened.evaluate(states)
-    if response.shape[1] == response.shape[2]:
-        response = response * (1 - np.eye(response.shape[1]))
-    return degrees, response.sum(2).T.reshape(-1, len(degrees), len(degrees))
+        response = headset.collect(opened.evaluate(states))
+    return degrees, response.T.reshape(-1, len(degrees), len(degrees))
 
 
 def draw_maps(figure, path, headset):
@@ -36,7 +42,7 @@ def draw_maps(figure, path, headset):
     headset   Headset, or path of its file
     """
     headset = as_headset(headset)
-    degrees, maps = sensor_maps(path)
+    degrees, maps = sensor_maps(path, headset)
     count = len(maps)
     columns = 4 if count > 3 else count + 1
     rows = -(-(count + 1) // columns)

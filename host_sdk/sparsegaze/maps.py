@@ -20,7 +20,7 @@ import numpy as np
 
 from . import __version__
 from .errors import SceneError
-from .headset import Headset, load_headset
+from .headset import Headset, lit_of, load_headset
 from .mapjudge import mean_response
 from .mapmake import Making
 from .mapstore import read_map, write_npz
@@ -82,11 +82,14 @@ class GazeMap:
     not_modelled: str = NOT_MODELLED
 
     def sensor_maps(self, state=0, part=None):
-        """What each sensor collects with all other emitters lit, [sensor, elevation, azimuth]."""
+        """What each sensor collects with its emitters lit, [sensor, elevation, azimuth]."""
         values = (self.parts[part] if part else self.response)[state]
-        if values.shape[0] == values.shape[1] > 1:
-            values = values * (1 - np.eye(len(values)))[:, :, None, None]
-        return values.sum(1)
+        return np.where(self.lit[:, :, None, None], values, 0.0).sum(1)
+
+    @property
+    def lit(self):
+        """bool [sensor, emitter]: who is lit while a sensor senses."""
+        return lit_of(self.headset)
 
     def save(self, path, parts=True):
         """Write an .npz file, whole or not at all. OSError when it cannot be written."""

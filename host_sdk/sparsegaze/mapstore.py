@@ -11,6 +11,7 @@ import zipfile
 import numpy as np
 
 from .errors import SceneError
+from .headset import lit_of
 
 FORMAT = 1
 MOST_BYTES = 4 << 30  # of one array; more is refused unread
@@ -126,7 +127,17 @@ def _fields(found, refuse):
     for name in _ARRAYS:
         out[name] = found[name]
     _check_shapes(out, parts, refuse)
+    _check_headset(out["headset"], out["response"].shape[1:3], refuse)
     return dict(out, parts=parts)
+
+
+def _check_headset(headset, pairs, refuse):
+    try:
+        lit = lit_of(headset)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+        refuse("its headset is not one")
+    if lit.shape != pairs:
+        refuse("its headset has %d sensors and %d emitters, its response %d and %d" % (lit.shape + pairs))
 
 
 def _check_shapes(out, parts, refuse):

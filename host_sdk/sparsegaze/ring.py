@@ -58,7 +58,7 @@ def ring_figures(person=None, lens_radius_mm=LENS_RADIUS_MM):
 
 
 def ring_of_sensors(made, state=0):
-    """Where each sensor's glint is brightest against everything else, other emitters lit: a list of
+    """Where each sensor's glint is brightest against everything else, its emitters lit: a list of
     {sensor, azimuth_deg, elevation_deg, glint_percent, within (false: on the map's border, so that the
     brightest place may lie outside)}. Empty when the parts were not kept; no entry without a glint.
     """

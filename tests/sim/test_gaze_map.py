@@ -243,6 +243,8 @@ def rewritten(small, path, **changed):
         {"part_iris": np.zeros(3)},
         {"headset": np.array("{")},
         {"headset": np.array("[1]")},
+        {"headset": np.array("{}")},
+        {"headset": np.array('{"sensors": [{"position_mm": [0, 0, 1]}], "emitters": []}')},
         {"person": np.array(7.0)},
         {"left_out": np.array("{}")},
         {"mean": np.array(np.nan)},

@@ -43,10 +43,44 @@ def test_the_default_headset_leaves_the_view_free_and_keeps_its_distance(led2gaz
         assert 8 <= led.sigma_deg <= 12
 
 
-def test_the_default_headset_names_each_leds_pins_once(led2gaze):
-    pins = [entry["anode_pin"] for entry in led2gaze.wiring.values()]
-    pins += [entry["cathode_pin"] for entry in led2gaze.wiring.values()]
-    assert sorted(pins) == ["A0", "A1", "A2", "A3", "A4", "A5", "D2", "D3", "D4", "D5", "D6", "D7"]
+def test_the_default_headset_has_a_pin_for_each_led_and_leaves_the_digital_ones_free(led2gaze):
+    assert [led.pin for led in led2gaze.sensors] == ["A0", "A1", "A2", "A3", "A4", "A5"]
+
+
+def test_every_led_of_the_default_headset_senses_once_with_the_four_others_lit(led2gaze):
+    assert [phase.sense for phase in led2gaze.phases] == [(5, 0), (1, 4), (2, 3)]
+    assert (led2gaze.lit.sum(1) == 4).all() and not led2gaze.lit.diagonal().any()
+    for phase in led2gaze.phases:
+        assert set(phase.sense) | set(phase.light) == set(range(6))
+        assert not led2gaze.lit[np.ix_(phase.sense, phase.sense)].any()
+
+
+def test_without_phases_a_sensor_collects_from_whoever_stands_elsewhere(led2gaze):
+    assert (replace(led2gaze, phases=()).lit == ~np.eye(6, dtype=bool)).all()
+    apart = pair(port((12, 0, -30)), port((10, -10, -30)))
+    assert apart.lit.tolist() == [[True]]
+    lone = port((12, 0, -30))
+    assert pair(lone, lone).lit.tolist() == [[True]], "one that has nobody else sees itself"
+
+
+def test_what_a_sensor_collects_is_the_sum_over_those_who_are_lit(led2gaze):
+    response = np.arange(72.0).reshape(2, 6, 6)
+    lit = [[j for j in range(6) if led2gaze.lit[i, j]] for i in range(6)]
+    by_hand = [[sum(response[n, i, j] for j in lit[i]) for i in range(6)] for n in (0, 1)]
+    assert led2gaze.collect(response).tolist() == by_hand
+    response[:, 0, 5] = np.nan  # not lit: not looked at
+    assert led2gaze.collect(response)[0, 0] == by_hand[0][0]
+
+
+def test_pins_and_phases_are_no_part_of_what_a_cached_map_depends_on(led2gaze):
+    bare = replace(
+        led2gaze,
+        phases=(),
+        board={},
+        wiring={},
+        sensors=tuple(replace(p, pin=None, intensity_mw_sr=None, series_ohm=None) for p in led2gaze.sensors),
+    )
+    assert bare.describe() == led2gaze.describe()
 
 
 def test_sensors_and_emitters_may_be_separate(tmp_path):
@@ -77,6 +111,21 @@ def test_sensors_and_emitters_may_be_separate(tmp_path):
         (LED.replace("= 1.5", "= -1.5"), "lens_radius_mm"),
         (LED.replace("lens_radius_mm = 1.5", ""), "lens_radius_mm"),
         (LED * 33, "33"),
+        (LED + 'pin = 3\n', "pin"),
+        (LED + "shade = 3\n", "no key shade"),
+        (LED + 'anode_pin = "D2"\n', "anode_pin is gone"),
+        (LED + 'cathode_pin = "A2"\n', "cathode_pin is gone"),
+        (LED + "intensity_mw_sr = -1.0\n", "intensity_mw_sr"),
+        (LED + 'wavelength_nm = "940"\n', "wavelength_nm"),
+        (LED + "source_diameter_mm = 0\n", "source_diameter_mm"),
+        (LED + "series_ohm = nan\n", "series_ohm"),
+        (LED.replace("led", "sensor") + "current_ma = 3\n", "no key current_ma"),
+        (LED.replace("led", "emitter").replace("sensitivity", "beam") * 2, "0 sensors"),
+        ("colour = 1\n" + LED, "no key colour"),
+        ("board = 1\n" + LED, "[board]"),
+        ("[board]\nrail = 2\n" + LED, "no key rail"),
+        ("name = 3\n" + LED, "name is not text"),
+        (2 * (LED + 'name = "one"\n'), "there is a one already"),
     ],
 )
 def test_a_malformed_headset_is_refused_naming_the_entry(tmp_path, text, says):

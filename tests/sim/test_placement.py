@@ -60,9 +60,11 @@ def test_the_same_eye_with_darker_tissue_tells_less(placement, led2gaze):
     assert error[1] > 1.4 * error[0]
 
 
-def test_light_is_counted_from_the_reference(placement, led2gaze):
-    scene = Scene(led2gaze, nominal_person(), quality=placement.QUICK)
-    assert placement.light_na(scene).mean() == pytest.approx(200.0, rel=0.03)
+def test_light_is_counted_from_the_reference_which_is_all_five_others(placement, led2gaze):
+    five = Scene(replace(led2gaze, phases=()), nominal_person(), quality=placement.QUICK)
+    assert placement.light_na(five).mean() == pytest.approx(200.0, rel=0.03)
+    four = Scene(led2gaze, nominal_person(), quality=placement.QUICK)
+    assert placement.light_na(four).mean() == pytest.approx(160.0, rel=0.1)
 
 
 def test_the_search_refuses_people_whom_reports_are_about(placement, led2gaze):
