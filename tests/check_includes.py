@@ -17,13 +17,15 @@ CORE = {
     "sg_q": set(), "sg_rom": set(), "sg_err": set(),
     "sg_wire": {"sg_err"},
     "sg_model": {"sg_err", "sg_q", "sg_rom", "sg_crc32_table"}, "sg_crc32_table": {"sg_rom"},
-    "sg_expose": {"sg_rom", "sg_expose_table"}, "sg_expose_table": {"sg_rom"},
+    "sg_light": {"sg_rom", "sg_light_table"}, "sg_light_table": {"sg_rom"},
+    "sg_expose": set(), "sg_health": set(),
     "sg_link": {"sg_err", "sg_wire"},
     "sg_gp": {"sg_err", "sg_q", "sg_rom", "sg_model", "sg_gp_loop"},
     "sg_gp_loop": {"sg_q", "sg_rom", "sg_gp"}, "sg_gp_table": {"sg_gp_loop", "sg_rom"}, "sg_gp_avr": set(),
     "sg_mlp": {"sg_err", "sg_rom", "sg_model", "sg_mlp_loop"},
     "sg_mlp_loop": {"sg_rom"}, "sg_mlp_table": {"sg_mlp_loop", "sg_rom"}, "sg_mlp_avr": set(),
-    "sg_track": {"sg_err", "sg_q", "sg_wire", "sg_model", "sg_gp", "sg_expose"},
+    "sg_track": {"sg_err", "sg_q", "sg_wire", "sg_model", "sg_gp", "sg_rom", "sg_light",
+                 "sg_expose", "sg_health"},
 }
 ARCHITECTURE = re.compile(r"__AVR|__arm__|__ARM|__x86_64|__i386|_M_X64|__riscv|__thumb|_WIN32|__linux__|"
                           r"__APPLE__")

@@ -4,20 +4,19 @@
 #include "sg_err.h"
 #include "sg_expose.h"
 #include "sg_gp.h"
+#include "sg_light.h"
 #include "sg_q.h"
+#include "sg_rom.h"
 
 // The siblings do not know the wire, but their flags travel on it as they are.
 _Static_assert((int)SG_GP_OUT_OF_RANGE == (int)SG_FLAG_OUT_OF_RANGE, "flag value");
-_Static_assert((int)SG_EXPOSE_SATURATED == (int)SG_FLAG_SATURATED, "flag value");
-_Static_assert((int)SG_EXPOSE_STARVED == (int)SG_FLAG_STARVED, "flag value");
-
-uint8_t sg_track_features(const uint16_t code_q2[6], const uint16_t exposure_cycles[6], uint16_t feature[6])
-{
-    uint8_t flags = 0;
-    for (uint8_t i = 0; i < SG_WIRE_CHANNELS; i++)
-        flags |= sg_expose_feature(code_q2[i], exposure_cycles[i], &feature[i]);
-    return flags;
-}
+_Static_assert((int)SG_LIGHT_SATURATED == (int)SG_FLAG_SATURATED, "flag value");
+_Static_assert((int)SG_LIGHT_STARVED == (int)SG_FLAG_STARVED, "flag value");
+_Static_assert((int)SG_LIGHT_CHANNELS == (int)SG_WIRE_CHANNELS, "channels");
+_Static_assert((int)SG_HEALTH_OPEN == (int)SG_FAULT_OPEN && (int)SG_HEALTH_SHORT == (int)SG_FAULT_SHORT
+               && (int)SG_HEALTH_LOW == (int)SG_FAULT_LOW && (int)SG_HEALTH_HIGH == (int)SG_FAULT_HIGH, "fault value");
+_Static_assert((int)SG_EXPOSE_SATURATED_CODE == (int)SG_LIGHT_SATURATED_CODE
+               && (int)SG_HEALTH_FULL_CODE == (int)SG_LIGHT_SATURATED_CODE, "one idea of full");
 
 // One row of G g, Q7, rounded: at most 2^14. Q9 times Q7 is Q16, high and low byte of the angle apart, as the
 // AVR multiplies: floor((256 a + b) / 512) is floor((a + floor(b / 256)) / 2).
@@ -52,7 +51,7 @@ static uint8_t correct(const struct sg_affine *affine, int16_t deg_q7[2])
 int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], uint8_t raw_flags,
                    const struct sg_affine *recentre, struct sg_gaze *out)
 {
-    uint8_t flags = raw_flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_EXPOSURE | SG_FLAG_TRIAL
+    uint8_t flags = raw_flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_EXPOSURE | SG_FLAG_FAULT
                                  | SG_FLAG_RECOVERING);
     int16_t deg_q7[2] = { 0, 0 };
     uint8_t sigma_log2_q4 = SG_GP_SIGMA_UNKNOWN;
@@ -69,7 +68,8 @@ int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], 
             result = SG_E_RANGE;
         flags |= result == SG_OK ? point.flags : (uint8_t)SG_FLAG_OUT_OF_RANGE;
         sigma_log2_q4 = result == SG_OK ? point.sigma_log2_q4 : (uint8_t)SG_GP_SIGMA_HUGE;
-        if (!(flags & (SG_FLAG_OUT_OF_RANGE | SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_RECOVERING)))
+        if (!(flags & (SG_FLAG_OUT_OF_RANGE | SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_FAULT
+                       | SG_FLAG_RECOVERING)))
             flags |= SG_FLAG_VALID;
     }
     out->t_us = 0;
@@ -79,4 +79,15 @@ int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], 
     out->flags = flags;
     out->sigma_log2_q4 = sigma_log2_q4;
     return result;
+}
+
+void sg_track_range(const struct sg_model_view *view, uint8_t channel, struct sg_health_sight *sight)
+{
+    if (view == NULL) {
+        sight->offset = sight->gain_q12 = 0;
+        return;
+    }
+    const uint8_t *at = view->image + (uint8_t)(channel << 1);
+    sight->offset = sg_rom_u16(at + offsetof(struct sg_model_head, offset), view->space);
+    sight->gain_q12 = sg_rom_u16(at + offsetof(struct sg_model_head, gain_q12), view->space);
 }

@@ -4,8 +4,8 @@
 #include <stdint.h>
 
 #include "sg_err.h"
-#include "sg_expose.h"
 #include "sg_gp.h"
+#include "sg_light.h"
 #include "sg_mlp.h"
 #include "sg_track.h"
 
@@ -19,9 +19,10 @@ int sg_batch_infer(const struct sg_model_view *view, const uint16_t *features, c
 int sg_batch_predict(const struct sg_model_view *view, const uint16_t *features, struct sg_gp_point *out,
                      size_t n);
 
-// sg_expose_feature over n readings. flags[n] or NULL.
-void sg_batch_feature(const uint16_t *code_q2, const uint16_t *exposure_cycles, uint16_t *feature,
-                      uint8_t *flags, size_t n);
+// sg_light_add over n readings, and sg_light_features after every `repeats` of them. feature[n / repeats * 6];
+// flags[n / repeats] or NULL.
+void sg_batch_light(struct sg_light *light, const struct sg_reading *reading, size_t n, size_t repeats,
+                    uint16_t *feature, uint8_t *flags);
 
 // sg_mlp_predict over n points. inputs[n * view->inputs]; outputs[n * view->outputs]; flags[n].
 void sg_batch_mlp(const struct sg_mlp_view *view, const uint16_t *inputs, int16_t *outputs, uint8_t *flags,
@@ -54,13 +55,17 @@ int sg_batch_predict(const struct sg_model_view *view, const uint16_t *features,
     return worst;
 }
 
-void sg_batch_feature(const uint16_t *code_q2, const uint16_t *exposure_cycles, uint16_t *feature,
-                      uint8_t *flags, size_t n)
+void sg_batch_light(struct sg_light *light, const struct sg_reading *reading, size_t n, size_t repeats,
+                    uint16_t *feature, uint8_t *flags)
 {
-    for (size_t i = 0; i < n; i++) {
-        const uint8_t seen = sg_expose_feature(code_q2[i], exposure_cycles[i], feature + i);
+    for (size_t i = 0, frame = 0; i < n; i++) {
+        sg_light_add(light, reading + i);
+        if ((i + 1) % repeats != 0)
+            continue;
+        const uint8_t seen = sg_light_features(light, feature + 6 * frame);
         if (flags != NULL)
-            flags[i] = seen;
+            flags[frame] = seen;
+        frame++;
     }
 }
 
