@@ -29,7 +29,7 @@ ATMEGABOOT = BOOTLOADERS / "atmega" / "ATmegaBOOT_168_atmega328.hex"
 QUIET = {
     "photocurrent.part_spread": 0, "node.leakage_spread": 0, "node.leakage_na": 0,
     "adc.noise_lsb": 0, "adc.inl_lsb": 0, "adc.offset_lsb": 0, "adc.gain_error": 0,
-    "supply.ripple_mv": 0, "supply.source_ohm": 0, "clock.error": 0,
+    "supply.ripple_mv": 0, "supply.source_ohm": 0, "clock.error": 0, "rail_noise_mv": 0, "rail_ohm": 0,
 }
 
 

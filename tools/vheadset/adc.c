@@ -61,6 +61,8 @@ void adc_trigger(struct adc *a, enum adc_source source, uint64_t cycle)
 void adc_catch_up(struct adc *a, uint64_t cycle)
 {
     int channel = a->admux & 15;
+    if (a->before)
+        a->before(a->before_param, cycle);
     if (a->join_at && a->join_at <= cycle) {
         if (channel < LEDS_COUNT)
             leds_join(a->leds, channel, a->join_at, a->held_volts);
@@ -73,13 +75,15 @@ void adc_catch_up(struct adc *a, uint64_t cycle)
     if (channel < LEDS_COUNT)
         a->held_volts = leds_sample(a->leds, channel, at);
     else if (channel == CHANNEL_TEMPERATURE)
-        a->held_volts = 0.314 + 0.001 * leds_temperature_k(a->leds);
+        a->held_volts = 0.314 + 0.001 * a->leds->warmer_k;
     else if (channel == CHANNEL_BANDGAP)
         a->held_volts = a->bandgap_volts
                       + BANDGAP_NOISE_VOLTS * noise_normal(a->seed, NOISE_BANDGAP, a->conversions);
     else if (channel == CHANNEL_GROUND)
         a->held_volts = 0;
-    // A6 and A7 are wired to nothing: the capacitor keeps what it had.
+    else if (channel == a->leds->wiring->supply_channel)
+        a->held_volts = leds_divider(a->leds, at);
+    // Another of A6 and A7 is wired to nothing: the capacitor keeps what it had.
 }
 
 // Integral non-linearity at a fraction of the range: a fixed smooth curve with both ends at zero, largest
@@ -93,13 +97,15 @@ static double inl_shape(const struct adc *a, double x)
     return sum * a->inl_scale;
 }
 
-static double reference(const struct adc *a, uint64_t cycle, double ripple)
+struct reference_noise { double supply_volts, bandgap_volts; };
+
+static double reference(const struct adc *a, uint64_t cycle, const struct reference_noise *noise)
 {
     switch (a->admux >> 6) {
     case 1:
-        return leds_supply_volts(a->leds, cycle) + ripple;
+        return lamps_supply_at(&a->leds->lamps, cycle) + noise->supply_volts;
     case 3:
-        return a->bandgap_volts;
+        return a->bandgap_volts + noise->bandgap_volts;
     default:  // AREF carries only a capacitor on a Nano: it reads as nothing
         return 1e-3;
     }
@@ -111,8 +117,11 @@ static uint16_t convert(struct adc *a, uint64_t sampled_at)
     double clock_hz = a->avr->frequency / (double)a->divisor;
     double fast = fmax(clock_hz - SLOW_CLOCK_HZ, 0) / (FAST_CLOCK_HZ - SLOW_CLOCK_HZ);
     double worse = 1.0 + (FAST_CLOCK_FACTOR - 1.0) * fast;
-    double ripple = a->physics->supply.ripple_mv * 1e-3 * noise_normal(a->seed, NOISE_RIPPLE_REFERENCE, n);
-    double full = reference(a, sampled_at, ripple);
+    struct reference_noise noise = {
+        a->physics->supply.ripple_mv * 1e-3 * noise_normal(a->seed, NOISE_RIPPLE_REFERENCE, n),
+        BANDGAP_NOISE_VOLTS * noise_normal(a->seed, NOISE_BANDGAP_REFERENCE, n),
+    };
+    double full = reference(a, sampled_at, &noise);
     double error_lsb = a->offset_lsb
                      + a->physics->adc.noise_lsb * worse * noise_normal(a->seed, NOISE_ADC, n)
                      + a->physics->adc.inl_lsb * worse * inl_shape(a, fmin(fmax(a->held_volts / full, 0), 1));
@@ -121,7 +130,7 @@ static uint16_t convert(struct adc *a, uint64_t sampled_at)
     for (int bit = 9; bit >= 0; bit--) {
         uint64_t at = sampled_at + (uint64_t)a->divisor * (unsigned)(10 - bit);
         unsigned trial = code | 1u << bit;
-        if (input >= (trial - 0.5) / 1024 * reference(a, at, ripple))
+        if (input >= (trial - 0.5) / 1024 * reference(a, at, &noise))
             code = trial;
     }
     return (uint16_t)code;

@@ -42,6 +42,8 @@ struct adc {
     bool first, busy, locked;
     uint8_t admux;                // as latched at the start
     unsigned divisor;             // as latched at the start
+    void (*before)(void *param, uint64_t cycle);  // what else is due by then, called first; may be NULL
+    void *before_param;
 };
 
 void adc_attach(struct adc *adc, avr_t *avr, struct leds *leds, const struct physics *physics, uint64_t seed);

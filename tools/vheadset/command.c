@@ -201,15 +201,15 @@ static void do_set(struct call *c)
     struct person *person = &c->nano->person;
     const char *key = c->words == 3 ? c->word[1] : "", *value = c->words == 3 ? c->word[2] : "";
     enum ambient ambient;
-    enum light light;
+    enum light_level light;
     double number = 0;
     bool good = false;
     if (!strcmp(key, "ambient")) {
         if ((good = !config_ambient(value, &ambient)))
-            leds_set_ambient(&c->nano->leds, ambient);
+            (leds_settle(&c->nano->leds, c->nano->avr->cycle), light_set_ambient(&c->nano->leds.light, ambient));
     } else if (!strcmp(key, "light")) {
         if ((good = !config_light(value, &light)))
-            leds_set_light(&c->nano->leds, light);
+            (leds_settle(&c->nano->leds, c->nano->avr->cycle), light_set_level(&c->nano->leds.light, light));
     } else if (!strcmp(key, "lid")) {
         good = !strcmp(value, "auto") || real(value, 0, 1, &number);
         if (good)
@@ -272,7 +272,7 @@ static void do_node(struct call *c)
     }
     const struct led *led = &c->nano->leds.led[i];
     double volts = leds_peek(&c->nano->leds, (int)i, c->nano->avr->cycle);
-    say(c, "ok %.15g %d %" PRIu64 " %.15g", volts, (int)led->drive, led->since, c->nano->adc.held_volts);
+    say(c, "ok %.15g %d %" PRIu64 " %.15g", volts, (int)led->drive, led->event, c->nano->adc.held_volts);
 }
 
 static void do_quit(struct call *c)

@@ -6,6 +6,12 @@
 #include <stdlib.h>
 #include <string.h>
 
+// The board's own parts, README.md: a TL431 as shunt of 2.5 V, the divider on A7.
+static const double RAIL_VOLTS = 2.5, RAIL_OHM = 0.3, RAIL_NOISE_MV = 0.2;
+static const int SUPPLY_CHANNEL = 7;
+// A lit LED needs its forward voltage and something to set its current by.
+static const double SUPPLY_OVER_RAIL_VOLTS = 1.3;
+
 #define PHYSICS(section, key, low, high) \
     { #section "." #key, offsetof(struct physics, section.key), low, high }
 
@@ -59,13 +65,13 @@ int config_ambient(const char *name, enum ambient *out)
     return 0;
 }
 
-int config_light(const char *name, enum light *out)
+int config_light(const char *name, enum light_level *out)
 {
     static const char *const names[] = {"nominal", "dim", "bright", NULL};
     int i;
     if (pick(name, names, &i))
         return -1;
-    *out = (enum light)i;
+    *out = (enum light_level)i;
     return 0;
 }
 
@@ -124,6 +130,24 @@ static int store(struct config *c, bool *seen, const char *key, const char *valu
         *(key[0] == 'u' ? &c->unpaced : &c->auto_reset) = n != 0;
         return bad;
     }
+    if (!strcmp(key, "wiring")) {
+        static const char *const names[] = {"leds", "photodiodes", NULL};
+        int i = 0, bad = pick(value, names, &i);
+        c->wiring.photodiodes = i == 1;
+        return bad;
+    }
+    if (!strcmp(key, "supply_pin")) {
+        static const char *const names[] = {"A6", "A7", "none", NULL};
+        int i = 0, bad = pick(value, names, &i);
+        c->wiring.supply_channel = i == 2 ? -1 : 6 + i;
+        return bad;
+    }
+    if (!strcmp(key, "rail_volts"))
+        return number(value, 1.5, 3.5, &c->wiring.rail_volts);
+    if (!strcmp(key, "rail_ohm"))
+        return number(value, 0, 20, &c->wiring.rail_ohm);
+    if (!strcmp(key, "rail_noise_mv"))
+        return number(value, 0, 100, &c->wiring.rail_noise_mv);
     if (!strcmp(key, "pupil_mean_mm"))
         return number(value, 1.5, 8, &c->pupil_mean_mm);
     if (!strcmp(key, "map_reference"))
@@ -143,6 +167,7 @@ int config_read(struct config *config, const char *path, char *error, size_t err
     memset(config, 0, sizeof *config);
     config->bootloader_start = 0x7E00;
     config->auto_reset = true;
+    config->wiring = (struct board_wiring){false, RAIL_VOLTS, RAIL_OHM, RAIL_NOISE_MV, SUPPLY_CHANNEL};
     if (!file) {
         snprintf(error, error_bytes, "cannot read %s: %s", path, strerror(errno));
         return -1;
@@ -172,6 +197,11 @@ int config_read(struct config *config, const char *path, char *error, size_t err
             snprintf(error, error_bytes, "%s: missing key `%s`", path, PHYSICS_KEYS[i].name);
             return -1;
         }
+    if (config->physics.supply.volts < config->wiring.rail_volts + SUPPLY_OVER_RAIL_VOLTS) {
+        snprintf(error, error_bytes, "%s: supply.volts %g leaves no room over rail_volts %g to light an LED",
+                 path, config->physics.supply.volts, config->wiring.rail_volts);
+        return -1;
+    }
     if (!*config->state || !*config->control) {
         snprintf(error, error_bytes, "%s: missing key `%s`", path, *config->state ? "control" : "state");
         return -1;

@@ -13,7 +13,7 @@ enum { CONFIG_PATH_BYTES = 1024 };
 // Field names and units are those of physics.toml; a name there is `section.key` here.
 struct physics {
     struct { double nominal_na, dim_na, bright_na, part_spread, heat_per_k; } photocurrent;
-    struct { double junction_pf, pin_pf, sample_hold_pf, leakage_na, leakage_spread; } node;
+    struct node_physics { double junction_pf, pin_pf, sample_hold_pf, leakage_na, leakage_spread; } node;
     struct { double noise_lsb, inl_lsb, offset_lsb, gain_error, bandgap_v; } adc;
     struct { double offset_mv, noise_mv, delay_ns; } comparator;
     struct { double volts, source_ohm, ripple_mv; } supply;
@@ -24,8 +24,15 @@ struct physics {
     } eye;
 };
 
+// The board's own parts (README.md).
+struct board_wiring {
+    bool photodiodes;                    // else LEDs that sense and emit
+    double rail_volts, rail_ohm, rail_noise_mv;
+    int supply_channel;                  // of the converter, with the supply divider; -1 = none
+};
+
 enum ambient { AMBIENT_DARK, AMBIENT_ROOM, AMBIENT_BRIGHT_ROOM, AMBIENT_SUN_GAP };
-enum light { LIGHT_NOMINAL, LIGHT_DIM, LIGHT_BRIGHT };
+enum light_level { LIGHT_NOMINAL, LIGHT_DIM, LIGHT_BRIGHT };
 
 struct config {
     char bootloader[CONFIG_PATH_BYTES];  // "" = none: the chip starts at 0
@@ -39,9 +46,10 @@ struct config {
     uint64_t seed;
     bool unpaced, auto_reset;
     enum ambient ambient;
-    enum light light;
+    enum light_level light;
     double pupil_mean_mm;                // 0 = drawn from the seed
     double map_reference;                // sim_map_mean() of a map that gives nominal_na; 0 = of this map
+    struct board_wiring wiring;
     struct physics physics;
 };
 
@@ -50,7 +58,7 @@ int config_read(struct config *config, const char *path, char *error, size_t err
 
 // Names of ambient and light levels. Return 0, or -1 when there is no such level.
 int config_ambient(const char *name, enum ambient *out);
-int config_light(const char *name, enum light *out);
+int config_light(const char *name, enum light_level *out);
 
 // Print the required section.key names, one a line.
 void config_list_physics(FILE *out);

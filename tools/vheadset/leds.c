@@ -2,289 +2,313 @@
 #include "leds.h"
 
 #include <math.h>
-#include <stdlib.h>
 #include <simavr/avr_ioport.h>
 
-#include "../../sim_c/sim_map.h"
 #include "access.h"
 #include "adc.h"
 #include "noise.h"
-#include "person.h"
 
-enum { PINC = 0x26, DDRC = 0x27, PORTC = 0x28, DDRD = 0x2A, PORTD = 0x2B, MCUCR = 0x55, PUD = 0x10 };
-static const double BUILT_IN_VOLTS = 0.7, GRADING = 0.4, FLOOR_VOLTS = -0.25, FORWARD_VOLTS = 1.2;
-static const double PULLUP_OHM = 35e3;
-// Stated in the comments of physics.toml, [photocurrent], [node] and [ambient].
-static const double LED_AMPERES = 0.020, LEAKAGE_DOUBLES_K = 10;
-static const double ROOM_FLICKER = 0.3, BRIGHT_ROOM_FLICKER = 0.5;
-static const uint64_t RESPONSE_REUSE_CYCLES = 800;  // 50 us: the fastest saccade turns 0.03 deg
+enum { PINC = 0x26, MCUCR = 0x55, PUD = 0x10, EMITTER_PIN = 2 };
+static const double PULLUP_OHM = 35e3, DRIVER_OHM = 25;    // of a port pin: datasheet, pin pull-up and driver
+static const double LEAKAGE_DOUBLES_K = 10;                // comment of physics.toml, [node]
+static const double DIVIDER = 0.04;                        // 240k and 10k, with a capacitor: stiff
+static const double COVERED = 0.01, FINGER_LIGHT = 5, FINGER_AMBIENT = 0.1;
 
-double leds_charge_pc(const struct physics *p, double volts, double extra_pf)
+static struct led_part *part_of(struct leds *l, int pin)
 {
-    double power = 1 - GRADING, scale = p->node.junction_pf * BUILT_IN_VOLTS / power;
-    double junction = scale * (pow(1 + volts / BUILT_IN_VOLTS, power) - 1);
-    return junction + (p->node.pin_pf + extra_pf) * volts;
+    return &l->part[l->led[pin].part];
 }
 
-static double capacitance_pf(const struct physics *p, double volts)
+// As a sensor sees it: open, the pin has its own capacitance only.
+static struct charge_node node_of(struct leds *l, int i, double noise_volts)
 {
-    return p->node.junction_pf / pow(1 + volts / BUILT_IN_VOLTS, GRADING) + p->node.pin_pf;
+    const struct node_physics *n = &l->physics->node;
+    double junction_pf = part_of(l, i)->fault == FAULT_OPEN ? 0 : n->junction_pf;
+    return (struct charge_node){junction_pf, n->pin_pf + (l->joined == i ? n->sample_hold_pf : 0),
+                                l->lamps.rail_volts + noise_volts};
 }
 
-double leds_volts(const struct physics *p, double charge_pc, double extra_pf)
+static bool conducts(struct leds *l, int i)
 {
-    if (charge_pc <= leds_charge_pc(p, FLOOR_VOLTS, extra_pf))
-        return FLOOR_VOLTS;
-    double volts = charge_pc / (capacitance_pf(p, 2.5) + extra_pf);
-    for (int i = 0; i < 40; i++) {
-        if (volts < FLOOR_VOLTS)
-            volts = FLOOR_VOLTS;
-        double excess_pc = leds_charge_pc(p, volts, extra_pf) - charge_pc;
-        double step = excess_pc / (capacitance_pf(p, volts) + extra_pf);
-        volts -= step;
-        if (fabs(step) < 1e-12)
-            break;
+    enum led_fault fault = part_of(l, i)->fault;
+    return fault == FAULT_SHORT || fault == FAULT_SHORT_GROUND;
+}
+
+static bool driven(const struct led *led)
+{
+    return led->drive == LED_LOW || led->drive == LED_HIGH;
+}
+
+// No charge is kept there: whatever hangs on it takes its voltage.
+static bool stiff(struct leds *l, int i)
+{
+    return driven(&l->led[i]) || conducts(l, i);
+}
+
+static double supply_ripple(const struct leds *l, uint64_t n)
+{
+    return l->physics->supply.ripple_mv * 1e-3 * noise_normal(l->seed, NOISE_RIPPLE_SAMPLE, n);
+}
+
+static double rail_noise(const struct leds *l, enum noise_purpose purpose, uint64_t n)
+{
+    return l->wiring->rail_noise_mv * 1e-3 * noise_normal(l->seed, purpose, n);
+}
+
+static double stiff_volts(struct leds *l, int i, uint64_t cycle, double supply_noise, double noise_volts)
+{
+    enum led_fault fault = part_of(l, i)->fault;
+    if (l->led[i].drive == LED_LOW)
+        return 0;
+    if (l->led[i].drive == LED_HIGH) {
+        bool loaded = !l->wiring->photodiodes && fault != FAULT_OPEN;
+        return lamps_supply_at(&l->lamps, cycle) - (loaded ? DRIVER_OHM * l->lamps.amperes : 0) + supply_noise;
     }
-    return volts;
+    return fault == FAULT_SHORT ? l->lamps.rail_volts + noise_volts : 0;
 }
 
-static uint8_t lit_at(const struct leds *l, uint64_t cycle)
+static double volts_of(struct leds *l, int i, uint64_t cycle, double supply_noise, double noise_volts)
 {
-    for (unsigned i = 1; i <= LEDS_HISTORY; i++) {
-        const struct led_stretch *h = &l->history[(l->history_next - i) % LEDS_HISTORY];
-        if (h->since <= cycle)
-            return h->lit;
+    if (stiff(l, i))
+        return stiff_volts(l, i, cycle, supply_noise, noise_volts);
+    if (l->led[i].drive == LED_PULLUP)
+        return l->led[i].volts;
+    return charge_volts(node_of(l, i, noise_volts), l->led[i].charge_pc);
+}
+
+// Light of an emitter, 1 = a nominal one at 20 mA.
+static double brightness(const struct leds *l, int emitter)
+{
+    const struct led_part *part = &l->part[l->wiring->photodiodes ? LEDS_COUNT + emitter
+                                                                  : l->led[emitter].part];
+    return l->lamps.level * part->emitter * (part->fault == FAULT_COVERED ? COVERED : 1)
+         * (1 + l->physics->photocurrent.heat_per_k * l->warmer_k);
+}
+
+// Photocurrent and leakage of a pin between two cycles, nA.
+static double current_na(struct leds *l, int i, uint64_t from, uint64_t to)
+{
+    const struct led_part *part = part_of(l, i);
+    if (part->fault == FAULT_OPEN)
+        return 0;
+    double cover = part->fault == FAULT_COVERED ? COVERED : 1;
+    double leakage_na = part->leakage_na * exp2(l->warmer_k / LEAKAGE_DOUBLES_K);
+    double ambient_na = light_ambient_na(&l->light, from, to) * cover
+                      * (part->fault == FAULT_FINGER ? FINGER_AMBIENT : 1);
+    const double *response = l->lamps.on.lit ? light_response(&l->light, from + (to - from) / 2) : NULL;
+    double sum = 0, all = 0;
+    if (response) {
+        int emitters = l->wiring->photodiodes ? LEDS_EMITTERS : LEDS_COUNT;
+        for (int pin = 0; pin < emitters; pin++)
+            if (l->lamps.on.lit >> pin & 1) {
+                int column = l->wiring->photodiodes ? pin : l->led[pin].part;
+                double bright = brightness(l, pin);
+                sum += response[l->led[i].part * emitters + column] * bright;
+                all += bright;
+            }
+        if (part->fault == FAULT_FINGER)
+            sum += FINGER_LIGHT * l->light.reference * all / (LEDS_COUNT - 1);
     }
-    return l->lit;
+    return leakage_na + part->sensor * (ambient_na + l->light.scale_na * sum * cover);
 }
 
-double leds_supply_volts(const struct leds *l, uint64_t cycle)
-{
-    return l->physics->supply.volts
-         - l->physics->supply.source_ohm * LED_AMPERES * __builtin_popcount(lit_at(l, cycle));
-}
-
-double leds_temperature_k(const struct leds *l)
-{
-    return l->warmer_k;
-}
-
-static double ripple(const struct leds *l, enum noise_purpose purpose, uint64_t n)
-{
-    return l->physics->supply.ripple_mv * 1e-3 * noise_normal(l->seed, purpose, n);
-}
-
-// Response map at the middle of a stretch.
-static const double *response_at(struct leds *l, uint64_t cycle)
-{
-    uint64_t apart = cycle > l->response_cycle ? cycle - l->response_cycle : l->response_cycle - cycle;
-    if (!l->response_known || apart > RESPONSE_REUSE_CYCLES) {
-        struct person_view view;
-        person_view_at(l->person, (double)cycle / 16.0, &view);
-        sim_map_eval(l->map, &view.state, l->response);
-        l->response_cycle = cycle;
-        l->response_known = true;
-    }
-    return l->response;
-}
-
-// Mean photocurrent of the ambient light between two cycles, nA, for a nominal part.
-static double ambient_na(const struct leds *l, uint64_t from, uint64_t to)
-{
-    double steady = l->ambient_na * l->sensitivity;
-    if (l->ambient_flicker == 0 || to <= from)
-        return steady;
-    double w = 2 * M_PI * l->flicker_hz / l->cycles_per_true_second;
-    double end = w * (double)to + l->flicker_phase, begin = w * (double)from + l->flicker_phase;
-    double wave = (sin(end) - sin(begin)) / (w * (double)(to - from));
-    return steady * (1 - l->ambient_flicker * wave);
-}
-
-static double joined_pf(const struct leds *l, int i)
-{
-    return l->joined == i ? l->physics->node.sample_hold_pf : 0;
-}
-
-// Bring a floating node's voltage forward.
-static void discharge(struct leds *l, int i, uint64_t to)
+static void collect(struct leds *l, int i, uint64_t to)
 {
     struct led *led = &l->led[i];
-    double charge_fc = 0;  // nA times us
-    for (int k = 0; k < led->stretches; k++) {
-        uint64_t from = led->stretch[k].since;
-        uint64_t end = k + 1 < led->stretches ? led->stretch[k + 1].since : to;
-        if (end > to)
-            end = to;
-        if (end <= from)
-            continue;
-        double current_na = led->leakage_na * exp2(l->warmer_k / LEAKAGE_DOUBLES_K)
-                          + led->sensor * ambient_na(l, from, end);
-        uint8_t lit = (uint8_t)(led->stretch[k].lit & ~(1u << i));
-        if (lit && l->map) {
-            const double *row = response_at(l, from + (end - from) / 2) + i * LEDS_COUNT;
-            double sum = 0;
-            for (int e = 0; e < LEDS_COUNT; e++)
-                if (lit >> e & 1)
-                    sum += row[e] * l->led[e].emitter;
-            current_na += l->scale_na * led->sensor * sum
-                        * (1 + l->physics->photocurrent.heat_per_k * l->warmer_k);
-        }
-        charge_fc += current_na * (double)(end - from) / 16.0;
-    }
-    double extra_pf = joined_pf(l, i);
-    led->volts = leds_volts(l->physics, leds_charge_pc(l->physics, led->volts, extra_pf) - charge_fc * 1e-3,
-                            extra_pf);
-    led->since = to;
-    led->stretch[0] = (struct led_stretch){to, l->lit};
-    led->stretches = 1;
+    struct charge_node node = node_of(l, i, 0);
+    double ceiling_pc = charge_pc(node, node.rail_volts + CHARGE_CEILING_VOLTS);
+    led->charge_pc += current_na(l, i, led->since, to) * (double)(to - led->since) / 16.0 * 1e-3;
+    led->charge_pc = fmin(led->charge_pc, ceiling_pc);
 }
 
-// Charge a node through the pull-up; photocurrent is negligible beside it.
+// Charge a node through the pull-up, until the junction conducts; photocurrent is negligible beside it.
 static void pull_up(struct leds *l, int i, uint64_t to)
 {
     struct led *led = &l->led[i];
-    double supply = leds_supply_volts(l, to), left_s = (double)(to - led->since) / 16e6;
-    while (left_s > 0 && supply - led->volts > 1e-6) {
-        double tau = PULLUP_OHM * (capacitance_pf(l->physics, led->volts) + joined_pf(l, i)) * 1e-12;
+    struct charge_node node = node_of(l, i, 0);
+    double supply = lamps_supply_at(&l->lamps, to), left_s = (double)(to - led->since) / 16e6;
+    double most = node.junction_pf > 0 ? fmin(supply, node.rail_volts + CHARGE_CEILING_VOLTS) : supply;
+    while (left_s > 0 && most - led->volts > 1e-6) {
+        double tau = PULLUP_OHM * charge_pf(node, led->volts) * 1e-12;
         double step = fmin(left_s, tau / 16);
-        led->volts += (supply - led->volts) * -expm1(-step / tau);
+        led->volts = fmin(led->volts + (supply - led->volts) * -expm1(-step / tau), most);
         left_s -= step;
     }
-    led->since = to;
 }
 
 static void bring_to(struct leds *l, int i, uint64_t to)
 {
     struct led *led = &l->led[i];
-    if (to <= led->since)
+    if (to <= led->since || stiff(l, i))
         return;
     if (led->drive == LED_FLOAT)
-        discharge(l, i, to);
-    else if (led->drive == LED_PULLUP)
+        collect(l, i, to);
+    else
         pull_up(l, i, to);
-    else if (led->drive == LED_REVERSE)
-        led->volts = leds_supply_volts(l, to);
     led->since = to;
+}
+
+static void bring_all(struct leds *l, uint64_t to)
+{
+    for (int i = 0; i < LEDS_COUNT; i++)
+        bring_to(l, i, to);
+}
+
+// A node that was at some voltage begins to keep its charge.
+static void let_go(struct leds *l, int i, double volts)
+{
+    struct led *led = &l->led[i];
+    struct charge_node node = node_of(l, i, rail_noise(l, NOISE_RAIL_RELEASE, l->releases++));
+    led->volts = volts;
+    led->charge_pc = charge_pc(node, fmin(volts, node.rail_volts + CHARGE_CEILING_VOLTS));
 }
 
 static enum led_drive drive_of(const struct leds *l, int i)
 {
-    int cathode = 1 << i, anode = 4 << i;
-    bool anode_out = l->ddr_d & anode, anode_high = l->port_d & anode;
-    if (l->ddr_c & cathode) {
-        if (l->port_c & cathode)
-            return LED_REVERSE;
-        return anode_out && anode_high ? LED_EMIT : LED_OFF;
-    }
-    if ((l->port_c & cathode) && !(l->avr->data[MCUCR] & PUD))
-        return LED_PULLUP;
-    return anode_out ? LED_FLOAT : LED_OPEN;
+    uint8_t bit = (uint8_t)(1 << i);
+    if (l->ddr_c & bit)
+        return l->port_c & bit ? LED_HIGH : LED_LOW;
+    return (l->port_c & bit) && !(l->avr->data[MCUCR] & PUD) ? LED_PULLUP : LED_FLOAT;
 }
 
 static void enter(struct leds *l, int i, enum led_drive drive, uint64_t now)
 {
     struct led *led = &l->led[i];
-    enum led_drive was = led->drive;
-    if (was == drive)
+    if (led->drive == drive)
         return;
-    if (drive == LED_FLOAT || drive == LED_PULLUP || drive == LED_OPEN) {
-        bring_to(l, i, now);
-        if (was == LED_REVERSE)
-            led->volts = leds_supply_volts(l, now) + ripple(l, NOISE_RIPPLE_RELEASE, l->releases++);
-    }
+    bring_to(l, i, now);
+    double volts = volts_of(l, i, now, 0, 0);
+    bool released = drive == LED_FLOAT;
     led->drive = drive;
-    led->since = now;
-    led->stretches = 0;
-    if (drive == LED_OFF || drive == LED_EMIT)
-        led->volts = 0;
-    else if (drive == LED_REVERSE)
-        led->volts = leds_supply_volts(l, now);
-    else if (drive == LED_FLOAT)
-        led->stretch[led->stretches++] = (struct led_stretch){now, l->lit};
+    led->since = led->event = now;
+    if (released)
+        let_go(l, i, volts);
+    else
+        led->volts = volts;
+}
+
+static struct lamps_on emitters_on(struct leds *l)
+{
+    struct lamps_on on = {0, 0, 0};
+    if (l->wiring->photodiodes) {
+        for (int i = 0; i < LEDS_EMITTERS; i++)
+            if (l->port_d & l->ddr_d & 1 << (EMITTER_PIN + i) && l->part[LEDS_COUNT + i].fault != FAULT_OPEN)
+                on.lit |= (uint8_t)(1 << i);
+        return on;
+    }
+    for (int i = 0; i < LEDS_COUNT; i++) {
+        enum led_fault fault = part_of(l, i)->fault;
+        uint8_t *which = fault == FAULT_SHORT ? &on.shorted : fault == FAULT_SHORT_GROUND ? &on.grounded : &on.lit;
+        if (l->led[i].drive == LED_HIGH && fault != FAULT_OPEN)
+            *which |= (uint8_t)(1 << i);
+    }
+    return on;
 }
 
 static void pins_changed(struct leds *l, uint64_t now)
 {
-    enum led_drive drive[LEDS_COUNT];
-    uint8_t lit = 0;
-    adc_catch_up(l->adc, now);
+    leds_settle(l, now);
     for (int i = 0; i < LEDS_COUNT; i++) {
-        drive[i] = drive_of(l, i);
-        if (drive[i] == LED_EMIT)
-            lit |= (uint8_t)(1 << i);
+        enum led_drive drive = drive_of(l, i);
+        if (drive != LED_FLOAT)
+            enter(l, i, drive, now);
     }
-    if (lit != l->lit) {
-        l->history[l->history_next++ % LEDS_HISTORY] = (struct led_stretch){now, lit};
-        l->lit = lit;
-        for (int i = 0; i < LEDS_COUNT; i++) {
-            struct led *led = &l->led[i];
-            if (led->drive != LED_FLOAT)
-                continue;
-            if (led->stretches == LEDS_STRETCHES)
-                discharge(l, i, now);  // leaves one stretch that begins now
-            else
-                led->stretch[led->stretches++] = (struct led_stretch){now, lit};
-        }
-    }
-    for (int i = 0; i < LEDS_COUNT; i++)
-        enter(l, i, drive[i], now);
-    // A cathode input whose anode is driven high is pulled up through the diode.
-    for (int i = 0; i < LEDS_COUNT; i++)
-        if (l->led[i].drive == LED_FLOAT && (l->port_d & 4 << i)) {
-            bring_to(l, i, now);
-            l->led[i].volts = fmax(l->led[i].volts, leds_supply_volts(l, now) - FORWARD_VOLTS);
-        }
+    lamps_switch(&l->lamps, emitters_on(l), now);
+    for (int i = 0; i < LEDS_COUNT; i++)     // released against the rail of the new lights
+        enter(l, i, drive_of(l, i), now);
 }
 
-static bool driven(const struct led *led)
+void leds_settle(struct leds *l, uint64_t cycle)
 {
-    return led->drive == LED_OFF || led->drive == LED_EMIT || led->drive == LED_REVERSE;
+    adc_catch_up(l->adc, cycle);
+    bring_all(l, cycle);
 }
 
-void leds_join(struct leds *l, int channel, uint64_t cycle, double held_volts)
+// Parts were changed: floating nodes keep the voltages they had.
+static void rewire(struct leds *l, const double *volts, uint64_t cycle)
 {
-    struct led *led = &l->led[channel];
+    for (int i = 0; i < LEDS_COUNT; i++)
+        if (l->led[i].drive == LED_FLOAT)
+            l->led[i].charge_pc = charge_pc(node_of(l, i, 0),
+                                            fmin(volts[i], l->lamps.rail_volts + CHARGE_CEILING_VOLTS));
+    lamps_switch(&l->lamps, emitters_on(l), cycle);
+}
+
+static void look(struct leds *l, double *volts, uint64_t cycle)
+{
+    leds_settle(l, cycle);
+    for (int i = 0; i < LEDS_COUNT; i++)
+        volts[i] = volts_of(l, i, cycle, 0, 0);
+}
+
+void leds_set_fault(struct leds *l, int part, enum led_fault fault, uint64_t cycle)
+{
+    double volts[LEDS_COUNT];
+    look(l, volts, cycle);
+    l->part[part].fault = fault;
+    rewire(l, volts, cycle);
+}
+
+void leds_swap(struct leds *l, int a, int b, uint64_t cycle)
+{
+    double volts[LEDS_COUNT];
+    look(l, volts, cycle);
+    int part = l->led[a].part;
+    l->led[a].part = l->led[b].part;
+    l->led[b].part = part;
+    rewire(l, volts, cycle);
+}
+
+void leds_join(struct leds *l, int pin, uint64_t cycle, double held_volts)
+{
+    struct led *led = &l->led[pin];
     double sampler_pf = l->physics->node.sample_hold_pf;
-    if (!driven(led)) {
-        bring_to(l, channel, cycle);
-        double total_pc = leds_charge_pc(l->physics, led->volts, 0) + sampler_pf * held_volts;
-        led->volts = leds_volts(l->physics, total_pc, sampler_pf);
+    if (!stiff(l, pin)) {
+        bring_to(l, pin, cycle);
+        led->charge_pc += sampler_pf * held_volts;
+        if (led->drive == LED_PULLUP)
+            led->volts += (held_volts - led->volts) * sampler_pf
+                        / (charge_pf(node_of(l, pin, 0), led->volts) + sampler_pf);
     }
-    l->joined = channel;
+    l->joined = pin;
 }
 
-double leds_sample(struct leds *l, int channel, uint64_t cycle)
+double leds_sample(struct leds *l, int pin, uint64_t cycle)
 {
-    struct led *led = &l->led[channel];
     uint64_t n = l->samples++;
-    if (!driven(led))
-        bring_to(l, channel, cycle);
+    bring_to(l, pin, cycle);
+    if (!driven(&l->led[pin]))
+        l->led[pin].event = cycle;
+    double volts = volts_of(l, pin, cycle, supply_ripple(l, n), rail_noise(l, NOISE_RAIL_SAMPLE, n));
+    if (l->joined == pin)
+        l->led[pin].charge_pc -= l->physics->node.sample_hold_pf * volts;
     l->joined = -1;
-    if (led->drive == LED_REVERSE)
-        return leds_supply_volts(l, cycle) + ripple(l, NOISE_RIPPLE_SAMPLE, n);
-    return driven(led) ? 0 : led->volts;
+    return volts;
 }
 
 void leds_part(struct leds *l, uint64_t cycle)
 {
-    if (l->joined >= 0 && !driven(&l->led[l->joined]))
-        bring_to(l, l->joined, cycle);
+    int pin = l->joined;
+    if (pin < 0)
+        return;
+    bring_to(l, pin, cycle);
+    l->led[pin].charge_pc -= l->physics->node.sample_hold_pf * volts_of(l, pin, cycle, 0, 0);
     l->joined = -1;
+}
+
+double leds_divider(struct leds *l, uint64_t cycle)
+{
+    return DIVIDER * (lamps_supply_at(&l->lamps, cycle) + supply_ripple(l, l->samples++));
 }
 
 double leds_peek(struct leds *l, int i, uint64_t cycle)
 {
-    struct leds *copy = malloc(sizeof *copy);
-    if (!copy)
-        return NAN;
-    *copy = *l;
-    bring_to(copy, i, cycle);
-    double volts = copy->led[i].volts;
-    free(copy);
-    return volts;
+    struct leds copy = *l;
+    bring_to(&copy, i, cycle);
+    return volts_of(&copy, i, cycle, 0, 0);
 }
 
-static void on_port_c(avr_irq_t *irq, uint32_t value, void *param)
+static void port_c(avr_irq_t *irq, uint32_t value, void *param)
 {
     struct leds *l = param;
     (void)irq;
@@ -292,7 +316,7 @@ static void on_port_c(avr_irq_t *irq, uint32_t value, void *param)
     pins_changed(l, access_write_cycle(l->avr));
 }
 
-static void on_ddr_c(avr_irq_t *irq, uint32_t value, void *param)
+static void ddr_c(avr_irq_t *irq, uint32_t value, void *param)
 {
     struct leds *l = param;
     (void)irq;
@@ -300,23 +324,25 @@ static void on_ddr_c(avr_irq_t *irq, uint32_t value, void *param)
     pins_changed(l, access_write_cycle(l->avr));
 }
 
-static void on_port_d(avr_irq_t *irq, uint32_t value, void *param)
+static void port_d(avr_irq_t *irq, uint32_t value, void *param)
 {
     struct leds *l = param;
     (void)irq;
     l->port_d = (uint8_t)value;
-    pins_changed(l, access_write_cycle(l->avr));
+    if (l->wiring->photodiodes)
+        pins_changed(l, access_write_cycle(l->avr));
 }
 
-static void on_ddr_d(avr_irq_t *irq, uint32_t value, void *param)
+static void ddr_d(avr_irq_t *irq, uint32_t value, void *param)
 {
     struct leds *l = param;
     (void)irq;
     l->ddr_d = (uint8_t)value;
-    pins_changed(l, access_write_cycle(l->avr));
+    if (l->wiring->photodiodes)
+        pins_changed(l, access_write_cycle(l->avr));
 }
 
-// Digital level of the cathodes: libsimavr has no notion of a floating pin.
+// Digital level of the anodes: libsimavr has no notion of a floating pin.
 static uint8_t read_pins(avr_t *avr, avr_io_addr_t at, void *param)
 {
     struct leds *l = param;
@@ -326,7 +352,7 @@ static uint8_t read_pins(avr_t *avr, avr_io_addr_t at, void *param)
     for (int i = 0; i < LEDS_COUNT; i++)
         if (!(l->ddr_c >> i & 1)) {
             bring_to(l, i, now);
-            if (l->led[i].volts > l->physics->supply.volts / 2)
+            if (volts_of(l, i, now, 0, 0) > l->lamps.supply_volts / 2)
                 value |= (uint8_t)(1 << i);
         }
     return avr->data[at] = value;
@@ -335,55 +361,36 @@ static uint8_t read_pins(avr_t *avr, avr_io_addr_t at, void *param)
 void leds_seed(struct leds *l, uint64_t seed)
 {
     l->seed = seed;
-    l->flicker_phase = 2 * M_PI * noise_uniform(seed, NOISE_FLICKER_PHASE, 0);
-}
-
-void leds_set_ambient(struct leds *l, enum ambient ambient)
-{
-    const double na[] = {l->physics->ambient.dark_na, l->physics->ambient.room_na,
-                         l->physics->ambient.bright_room_na, l->physics->ambient.sun_gap_na};
-    const double flicker[] = {0, ROOM_FLICKER, BRIGHT_ROOM_FLICKER, 0};
-    l->ambient_na = na[ambient];
-    l->ambient_flicker = flicker[ambient];
-}
-
-void leds_set_light(struct leds *l, enum light light)
-{
-    const double na[] = {l->physics->photocurrent.nominal_na, l->physics->photocurrent.dim_na,
-                         l->physics->photocurrent.bright_na};
-    l->sensitivity = na[light] / na[LIGHT_NOMINAL];
-    double mean = l->map_reference > 0 || !l->map ? l->map_reference : sim_map_mean(l->map);
-    l->scale_na = l->map ? na[light] / mean : 0;
+    light_seed(&l->light, seed);
 }
 
 void leds_attach(struct leds *l, avr_t *avr, struct adc *adc, struct person *person,
                  const struct sim_map *map, const struct config *config, double cycles_per_true_second)
 {
     static const struct { char port; int irq; avr_irq_notify_t call; } hooks[] = {
-        {'C', IOPORT_IRQ_REG_PORT, on_port_c}, {'C', IOPORT_IRQ_DIRECTION_ALL, on_ddr_c},
-        {'D', IOPORT_IRQ_REG_PORT, on_port_d}, {'D', IOPORT_IRQ_DIRECTION_ALL, on_ddr_d},
+        {'C', IOPORT_IRQ_REG_PORT, port_c}, {'C', IOPORT_IRQ_DIRECTION_ALL, ddr_c},
+        {'D', IOPORT_IRQ_REG_PORT, port_d}, {'D', IOPORT_IRQ_DIRECTION_ALL, ddr_d},
     };
     const struct physics *p = &config->physics;
     memset(l, 0, sizeof *l);
     l->avr = avr;
     l->joined = -1;
     l->adc = adc;
-    l->person = person;
-    l->map = map;
-    l->map_reference = config->map_reference;
     l->physics = p;
-    l->cycles_per_true_second = cycles_per_true_second;
-    l->flicker_hz = noise_uniform(config->seed, NOISE_FLICKER, 0) < 0.5 ? 100 : 120;
+    l->wiring = &config->wiring;
     double spread = p->photocurrent.part_spread;
-    for (int i = 0; i < LEDS_COUNT; i++) {
-        struct led *led = &l->led[i];
-        led->sensor = noise_spread(spread, config->seed, NOISE_SENSOR_SPREAD, (uint64_t)i);
-        led->emitter = noise_spread(spread, config->seed, NOISE_EMITTER_SPREAD, (uint64_t)i);
-        led->leakage_na = p->node.leakage_na
-                        * noise_spread(p->node.leakage_spread, config->seed, NOISE_LEAKAGE, (uint64_t)i);
+    for (int i = 0; i < LEDS_PARTS; i++) {
+        struct led_part *part = &l->part[i];
+        uint64_t draw = (uint64_t)(i % LEDS_COUNT);
+        part->sensor = noise_spread(spread, config->seed, NOISE_SENSOR_SPREAD, draw);
+        part->emitter = noise_spread(spread, config->seed, NOISE_EMITTER_SPREAD, draw);
+        part->leakage_na = p->node.leakage_na
+                         * noise_spread(p->node.leakage_spread, config->seed, NOISE_LEAKAGE, draw);
     }
-    leds_set_ambient(l, config->ambient);
-    leds_set_light(l, config->light);
+    for (int i = 0; i < LEDS_COUNT; i++)
+        l->led[i].part = i;
+    light_attach(&l->light, p, map, person, config, cycles_per_true_second);
+    lamps_attach(&l->lamps, config);
     for (size_t i = 0; i < sizeof hooks / sizeof *hooks; i++) {
         avr_irq_t *irq = avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ(hooks[i].port), hooks[i].irq);
         irq->flags &= (uint8_t)~IRQ_FLAG_FILTERED;  // a reset changes pins behind its back
@@ -398,9 +405,8 @@ void leds_reset(struct leds *l, bool fresh)
     uint64_t now = l->avr->cycle;
     l->port_c = l->ddr_c = l->port_d = l->ddr_d = 0;
     pins_changed(l, now);
-    if (fresh)
-        for (int i = 0; i < LEDS_COUNT; i++) {
-            l->led[i].volts = 0;
-            l->led[i].since = now;
-        }
+    for (int i = 0; fresh && i < LEDS_COUNT; i++) {
+        l->led[i].since = l->led[i].event = now;
+        let_go(l, i, 0);
+    }
 }

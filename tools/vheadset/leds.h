@@ -1,19 +1,22 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// The six LEDs, electrically. LED i has its cathode on PC i and its anode, through a resistor, on PD (2 + i).
+// The six sensors, electrically: anode of LED i on PC i through a resistor, all cathodes on a quiet rail.
 //
-// Node      the cathode with the junction's and the pin's capacitance. Driven pins set it at once. With the
-//           anode low and the cathode an input without pull-up it floats: photocurrent, ambient light and
-//           leakage discharge it.
-// Charge    F(V) = Qj(V) + pin_pf V, Qj(V) = integral of C0 / (1 + v/0.7)^0.4 from 0 to V. Integrated
-//           exactly: the charge collected while floating is a sum over stretches of constant emitters, each
-//           with the response map at its middle; F is then inverted by Newton's method (to 1e-12 V).
+// Wiring    leds: the same six LEDs emit when their pin is high. photodiodes: photodiodes on PC 0..5 with
+//           their cathodes on the rail, three emitters from PD 2..4 to ground, lit when their pin is high.
+// Node      the anode, with the junction's and the pin's capacitance. A driven pin sets it at once. Pin low:
+//           0 V, the junction reverse-biased. With the pin an input without pull-up it floats: photocurrent,
+//           ambient light and leakage raise it from there.
+// Charge    q(V) of charge.h. The charge collected while floating is integrated exactly over stretches in
+//           which nothing else changes, each with the response map at its middle; q is then inverted.
 // Sampling  from the start of a conversion to its sample, the sample capacitor, still holding the last
-//           converted voltage, hangs on the node: the sum of both charges is kept, and both are discharged
+//           converted voltage, hangs on the node: the sum of both charges is kept, and both are charged
 //           together. A driven node is stiff and simply charges it.
-// Floor     illuminated, the junction stops at a forward voltage: the node does not fall below -0.25 V. The
-//           charged capacitor joins late, so a channel that ran into the floor reads 1.1 V or less, not zero.
-// Supply    each lit emitter draws 20 mA through source_ohm; ripple is drawn anew for every release of a
-//           node, every sample of a driven node and every conversion's reference.
+// Ceiling   illuminated, the junction stops at a forward voltage: the node does not rise above
+//           rail + 0.25 V.
+// Rail      carries noise, drawn independently at every release and every sample, and rises by rail_ohm times
+//           the current sent into it. A floating node follows by the share of its junction capacitance.
+// Supply    lamps.h; nothing of a floating node depends on it.
+// Faults    belong to a part, not to a pin: parts may be exchanged by leds_swap().
 #ifndef LEDS_H
 #define LEDS_H
 
@@ -22,58 +25,49 @@
 
 #include <simavr/sim_avr.h>
 
+#include "charge.h"
 #include "config.h"
+#include "lamps.h"
+#include "light.h"
 
 struct adc;
-struct person;
-struct sim_map;
 
-enum { LEDS_COUNT = 6, LEDS_STRETCHES = 24, LEDS_HISTORY = 32 };
+// Parts 0..5 are the LEDs or photodiodes; 6..8 the emitters of the photodiode wiring.
+enum { LEDS_COUNT = 6, LEDS_EMITTERS = 3, LEDS_PARTS = LEDS_COUNT + LEDS_EMITTERS };
 
-enum led_drive {
-    LED_OFF,      // node held low, or the LED biased in a way that neither lights nor senses
-    LED_EMIT,     // anode high, cathode low: lit
-    LED_REVERSE,  // cathode driven high
-    LED_PULLUP,   // cathode an input with its pull-up on
-    LED_FLOAT,    // cathode an input, anode low: sensing
-    LED_OPEN,     // cathode an input, anode an input: nothing to discharge through
+enum led_drive { LED_LOW, LED_HIGH, LED_PULLUP, LED_FLOAT };
+
+enum led_fault { FAULT_NONE, FAULT_OPEN, FAULT_SHORT, FAULT_SHORT_GROUND, FAULT_COVERED, FAULT_FINGER };
+
+struct led_part {
+    double sensor, emitter;    // spread, 1 = nominal
+    double leakage_na;
+    enum led_fault fault;
 };
 
-struct led_stretch { uint64_t since; uint8_t lit; };  // from a cycle on, these emitters were lit
-
-struct led {
+struct led {                   // a pin of port C
     enum led_drive drive;
-    double volts;              // of the node at `since`
+    double charge_pc;          // of the floating node at `since`
+    double volts;              // of the pulled-up node at `since`
     uint64_t since;
-    struct led_stretch stretch[LEDS_STRETCHES];
-    int stretches;
-    double sensor, emitter;    // part spread, 1 = nominal
-    double leakage_na;
+    uint64_t event;            // last change of drive, or sample while floating
+    int part;
 };
 
 struct leds {
     avr_t *avr;
     const struct physics *physics;
-    const struct sim_map *map; // NULL: no emitter reaches a sensor
-    struct person *person;
+    const struct board_wiring *wiring;
     struct adc *adc;
+    struct light light;
+    struct lamps lamps;
     uint64_t seed;
-    double cycles_per_true_second;
-    double map_reference;      // mean of the map that gives nominal_na; 0 = this map's own
-    double scale_na;           // photocurrent per map unit
-    double sensitivity;        // of this light level, relative to nominal
-    double ambient_na, ambient_flicker, flicker_hz, flicker_phase;
     double warmer_k;           // headset temperature above 25 C
     uint8_t port_c, ddr_c, port_d, ddr_d;
-    uint8_t lit;
-    struct led_stretch history[LEDS_HISTORY];  // ring of changes of `lit`, for the supply
-    unsigned history_next;
     uint64_t releases, samples;                // count draws
-    int joined;                                // LED whose node carries the sample capacitor, or -1
-    uint64_t response_cycle;
-    bool response_known;
-    double response[LEDS_COUNT * LEDS_COUNT];
+    int joined;                                // pin whose node carries the sample capacitor, or -1
     struct led led[LEDS_COUNT];
+    struct led_part part[LEDS_PARTS];
 };
 
 void leds_attach(struct leds *leds, avr_t *avr, struct adc *adc, struct person *person,
@@ -83,24 +77,25 @@ void leds_reset(struct leds *leds, bool fresh);
 
 // Draw noise from here on: the seed of a session.
 void leds_seed(struct leds *leds, uint64_t seed);
-void leds_set_ambient(struct leds *leds, enum ambient ambient);
-void leds_set_light(struct leds *leds, enum light light);
 
-// Join the sample capacitor, which holds held_volts, to the node of a channel at a cycle.
-void leds_join(struct leds *leds, int channel, uint64_t cycle, double held_volts);
+// Bring all nodes and samples forward to a cycle: call before anything changes that they depend on, such as
+// leds->light, warmer_k or lamps.
+void leds_settle(struct leds *leds, uint64_t cycle);
+// Change the state of a part from a cycle on.
+void leds_set_fault(struct leds *leds, int part, enum led_fault fault, uint64_t cycle);
+// Exchange the parts on two pins from a cycle on.
+void leds_swap(struct leds *leds, int a, int b, uint64_t cycle);
+
+// Join the sample capacitor, which holds held_volts, to the node of a pin at a cycle.
+void leds_join(struct leds *leds, int pin, uint64_t cycle, double held_volts);
 // Separate it again. Returns the voltage it now holds.
-double leds_sample(struct leds *leds, int channel, uint64_t cycle);
+double leds_sample(struct leds *leds, int pin, uint64_t cycle);
 // Separate it at a conversion that was called off.
 void leds_part(struct leds *leds, uint64_t cycle);
-// Supply at a recent cycle, without ripple.
-double leds_supply_volts(const struct leds *leds, uint64_t cycle);
-double leds_temperature_k(const struct leds *leds);  // above 25 C
+// What the supply divider shows at a sample, with ripple.
+double leds_divider(struct leds *leds, uint64_t cycle);
 
 // Voltage of a node at a cycle (not before the last event), looked at without disturbing anything.
-double leds_peek(struct leds *leds, int index, uint64_t cycle);
-
-// Junction and pin charge in pC (volts times pF), and its inverse.
-double leds_charge_pc(const struct physics *physics, double volts, double extra_pf);
-double leds_volts(const struct physics *physics, double charge_pc, double extra_pf);
+double leds_peek(struct leds *leds, int pin, uint64_t cycle);
 
 #endif

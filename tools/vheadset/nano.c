@@ -70,7 +70,7 @@ static void after_reset(struct nano *nano, enum nano_reset cause)
     nano->reset_flags = cause == NANO_RESET_POWER ? NANO_RESET_POWER : nano->reset_flags | (uint8_t)cause;
     avr->data[MCUSR] = nano->reset_flags;
     avr->run_cycle_limit = BATCH_CYCLES;
-    // INT0 and INT1 are on two anodes. Left alone, the stock module looks at such a pin every cycle while it
+    // INT0 and INT1 may be on pins that are driven. Left alone, the stock module looks at such a pin every cycle while it
     // is low, once more for every time it became low.
     avr_extint_set_strict_lvl_trig(avr, 0, 0);
     avr_extint_set_strict_lvl_trig(avr, 1, 0);
@@ -239,9 +239,10 @@ int nano_open(struct nano *nano, const struct config *config, struct bridge *bri
             snprintf(error, error_bytes, "cannot read the map %s: %s", config->map, why);
             return -1;
         }
-        if (sim_map_sensors(nano->map) != LEDS_COUNT || sim_map_emitters(nano->map) != LEDS_COUNT) {
-            snprintf(error, error_bytes, "%s is not a map of %d sensors and emitters", config->map,
-                     LEDS_COUNT);
+        int emitters = config->wiring.photodiodes ? LEDS_EMITTERS : LEDS_COUNT;
+        if (sim_map_sensors(nano->map) != LEDS_COUNT || sim_map_emitters(nano->map) != emitters) {
+            snprintf(error, error_bytes, "%s is not a map of %d sensors and %d emitters", config->map,
+                     LEDS_COUNT, emitters);
             return -1;
         }
     }

@@ -6,14 +6,16 @@
 //   'L'                    started on a high channel, multiplexer moved to a low one: both codes
 //   'F'                    ADIF: set after a conversion, cleared by writing one: two bytes
 //   'E'                    matches while OCF1B stays set, then after clearing it: conversions seen, two bytes
-//   'B'                    the bandgap against AVcc: code16
+//   'C' admux              one conversion: code16
 //   'I'                    interrupts counted while free running for 10 conversions' time
-//   'X' lit, flags, ticks16, dark16   an exposure of LED 0: code16
-//        flags 1: leave the pull-up on   2: sample capacitor from a low channel   4: lights out at `dark`
-//        ticks
+//   'X' lit, flags, ticks16, dark16   an exposure of LED 0, held low before, to OCR1B = ticks: code16
+//        flags 1: pull-up on   2: sample capacitor from LED 1, high   4: lights out at `dark` ticks
+//        8: prescaler 64   16: against the bandgap   32: mark the lights, port D's instead of port C's
+//   'Q' n, slot16, admux...  n conversions at prescaler 64, one every slot cycles by Timer1 compare B, the
+//        multiplexer moved on 80 cycles after each match: n code16
 #include "bench.h"
 
-enum { SLOW = _BV(ADEN) | _BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0) };
+enum { SLOW = _BV(ADEN) | _BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0), FAST = _BV(ADEN) | _BV(ADPS2) | _BV(ADPS1) };
 
 static volatile uint8_t interrupts;
 
@@ -28,13 +30,18 @@ static uint16_t get16(void)
     return (uint16_t)(low | bench_get() << 8);
 }
 
-static uint16_t convert(uint8_t channel)
+static uint16_t convert_as(uint8_t admux)
 {
-    ADMUX = _BV(REFS0) | channel;
+    ADMUX = admux;
     ADCSRA = SLOW | _BV(ADSC) | _BV(ADIF);
     while (!(ADCSRA & _BV(ADIF)))
         ;
     return ADC;
+}
+
+static uint16_t convert(uint8_t channel)
+{
+    return convert_as(_BV(REFS0) | channel);
 }
 
 static void arm(uint16_t ticks)
@@ -142,33 +149,78 @@ static void expose(void)
 {
     uint8_t lit = bench_get(), flags = bench_get();
     uint16_t ticks = get16(), dark = get16();
-    uint8_t port = flags & 1;
-    DDRD |= 0xFC;
     DDRC = 0x3F;
-    PORTC = 1;
-    convert(flags & 2 ? 1 : 0);
-    PORTD = (uint8_t)((lit & 0x3E) << 2) | 1;
+    PORTC = flags & 2 ? 2 : 0;
+    convert(flags & 2 ? 1 : 15);
+    if (flags & 32)
+        PORTD = lit;
+    lit = flags & 32 ? 0 : lit & 0x3E;
+    PORTC = lit;
     __builtin_avr_delay_cycles(80);
     arm(ticks);
+    if (flags & 8)
+        ADCSRA = FAST | _BV(ADATE) | _BV(ADIF);
+    if (flags & 16)
+        ADMUX = _BV(REFS1) | _BV(REFS0);
     TCCR1B = _BV(CS10);
-    __asm__ volatile("out %[ddr], %[mask]\n\tout %[port], %[value]\n\tout %[mark], %[one]"
+    __asm__ volatile("out %[ddr], %[mask]\n\tout %[mark], %[one]"
                      : : [ddr] "I"(_SFR_IO_ADDR(DDRC)), [mask] "r"((uint8_t)0x3E),
-                       [port] "I"(_SFR_IO_ADDR(PORTC)), [value] "r"(port),
                        [mark] "I"(_SFR_IO_ADDR(GPIOR1)), [one] "r"((uint8_t)1));
+    if (flags & 1)
+        PORTC = lit | 1;
     if (flags & 4) {
         while (TCNT1 < dark)
             ;
-        __asm__ volatile("out %[port], %[one]\n\tout %[mark], %[two]"
-                         : : [port] "I"(_SFR_IO_ADDR(PORTD)), [one] "r"((uint8_t)1),
-                           [mark] "I"(_SFR_IO_ADDR(GPIOR1)), [two] "r"((uint8_t)2));
+        if (flags & 32)
+            __asm__ volatile("out %[port], __zero_reg__\n\tout %[mark], %[two]"
+                             : : [port] "I"(_SFR_IO_ADDR(PORTD)), [mark] "I"(_SFR_IO_ADDR(GPIOR1)),
+                               [two] "r"((uint8_t)2));
+        else
+            __asm__ volatile("out %[port], __zero_reg__\n\tout %[mark], %[two]"
+                             : : [port] "I"(_SFR_IO_ADDR(PORTC)), [mark] "I"(_SFR_IO_ADDR(GPIOR1)),
+                               [two] "r"((uint8_t)2));
     }
     bench_put16(finish());
+    PORTC = 0;
+    PORTD = 0;
+}
+
+static void slots(void)
+{
+    uint8_t admux[20], n = bench_get();
+    uint16_t slot = get16(), codes[20];
+    for (uint8_t i = 0; i < n && i < 20; i++)
+        admux[i] = bench_get();
+    DDRC = 0;
+    PORTC = 0;
+    arm(slot);
+    ADMUX = admux[0];
+    ADCSRA = FAST | _BV(ADATE) | _BV(ADIF);
+    __asm__ volatile("out %[mark], %[one]\n\tsts %[ctl], %[one]"
+                     : : [mark] "I"(_SFR_IO_ADDR(GPIOR1)), [one] "r"((uint8_t)1),
+                       [ctl] "i"(_SFR_MEM_ADDR(TCCR1B)));
+    for (uint8_t i = 0; i < n && i < 20; i++) {
+        while (!(TIFR1 & _BV(OCF1B)))
+            ;
+        __builtin_avr_delay_cycles(80);
+        if (i + 1 < n)
+            ADMUX = admux[i + 1];
+        OCR1B = (uint16_t)((i + 2) * slot);
+        TIFR1 = _BV(OCF1B);
+        while (!(ADCSRA & _BV(ADIF)))
+            ;
+        codes[i] = ADC;
+        ADCSRA = FAST | _BV(ADATE) | _BV(ADIF);
+    }
+    ADCSRA = SLOW | _BV(ADIF);
+    for (uint8_t i = 0; i < n && i < 20; i++)
+        bench_put16(codes[i]);
 }
 
 int main(void)
 {
     bench_begin();
-    PORTD = 1;
+    DDRD |= 0xFC;
     convert(0);
     for (;;)
         switch (bench_get()) {
@@ -177,8 +229,9 @@ int main(void)
         case 'L': latch(); break;
         case 'F': flag(); break;
         case 'E': edge(); break;
-        case 'B': bench_put16(convert(14)); break;
+        case 'C': bench_put16(convert_as(bench_get())); break;
         case 'I': count_interrupts(); break;
         case 'X': expose(); break;
+        case 'Q': slots(); break;
         }
 }

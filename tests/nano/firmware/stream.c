@@ -3,11 +3,9 @@
 // of samples so far. The watchdog is fed until 'w' comes.
 #include "bench.h"
 
-static void precharge(void)
+static void convert(uint8_t admux)
 {
-    ADMUX = _BV(REFS0);
-    PORTC = 1;
-    DDRC = 0x3F;
+    ADMUX = admux;
     ADCSRA = _BV(ADEN) | _BV(ADSC) | _BV(ADIF) | 7;
     while (!(ADCSRA & _BV(ADIF)))
         ;
@@ -19,19 +17,17 @@ int main(void)
     uint8_t feed = 1;
     wdt_enable(WDTO_120MS);
     bench_begin();
-    DDRD |= 0xFC;
     TCCR1B = _BV(CS10);
     for (;;) {
         uint16_t start = TCNT1;
-        precharge();
-        PORTD = 0xF8 | 1;
-        DDRC = 0x3E;
+        DDRC = 0x3F;
         PORTC = 0;
+        convert(_BV(REFS1) | _BV(REFS0) | 15);
+        PORTC = 0x3E;
+        DDRC = 0x3E;
         __builtin_avr_delay_cycles(2000);
-        ADCSRA = _BV(ADEN) | _BV(ADSC) | _BV(ADIF) | 7;
-        while (!(ADCSRA & _BV(ADIF)))
-            ;
-        PORTD = 1;
+        convert(_BV(REFS1) | _BV(REFS0));
+        PORTC = 0;
         samples++;
         bench_put16(ADC);
         if (UCSR0A & _BV(RXC0)) {
