@@ -154,7 +154,6 @@ def test_rail_rises_with_the_current_sent_into_it(flat_map):
 def test_pull_up_left_on_drowns_the_photocurrent():
     with bench() as board:
         code, _, _, held = exposure(board, flags=1, ticks=2000)
-        assert board.node(0)[1] == 2                # pulled up
     assert held == pytest.approx(RAIL + 0.25, abs=1e-3) and code > 550
 
 

@@ -198,41 +198,69 @@ static void do_cut(struct call *c)
 
 static void do_set(struct call *c)
 {
-    struct person *person = &c->nano->person;
-    const char *key = c->words == 3 ? c->word[1] : "", *value = c->words == 3 ? c->word[2] : "";
-    enum ambient ambient;
-    enum light_level light;
-    double number = 0;
-    bool good = false;
-    if (!strcmp(key, "ambient")) {
-        if ((good = !config_ambient(value, &ambient)))
-            (leds_settle(&c->nano->leds, c->nano->avr->cycle), light_set_ambient(&c->nano->leds.light, ambient));
-    } else if (!strcmp(key, "light")) {
-        if ((good = !config_light(value, &light)))
-            (leds_settle(&c->nano->leds, c->nano->avr->cycle), light_set_level(&c->nano->leds.light, light));
-    } else if (!strcmp(key, "lid")) {
-        good = !strcmp(value, "auto") || real(value, 0, 1, &number);
-        if (good)
-            person->lid_forced = value[0] == 'a' ? -1 : number;
-    } else if (!strcmp(key, "microsaccades")) {
-        good = !strcmp(value, "0") || !strcmp(value, "1");
-        if (good)
-            person->microsaccades = value[0] == '1';
-    } else if (!strcmp(key, "pupil_mean_mm")) {
-        if ((good = real(value, 1.5, 8, &number)))
-            person->pupil_mean_mm = number;
-    } else if (!strcmp(key, "warmer_k")) {
-        if ((good = real(value, -60, 60, &number)))
-            c->nano->leds.warmer_k = number;
-    } else if (!strncmp(key, "slip_", 5) && key[5] >= 'x' && key[5] <= 'z' && !key[6]) {
-        if ((good = real(value, -20, 20, &number)))
-            person->slip_mm[key[5] - 'x'] = number;
-    } else {
-        say(c, "err set takes ambient, light, lid, microsaccades, pupil_mean_mm, warmer_k, slip_x, slip_y"
-            " or slip_z and a value");
+    struct setting setting;
+    const char *why = c->words != 3 ? "set takes a key and a value"
+                                    : setting_parse(c->nano, c->word[1], c->word[2], &setting);
+    if (!why)
+        setting_apply(c->nano, &setting, c->nano->avr->cycle);
+    say(c, why ? "err %s" : "ok", why);
+}
+
+static void do_set_at(struct call *c)
+{
+    struct setting setting;
+    uint64_t cycle = 0;
+    const char *why;
+    if (c->words == 2 && !strcmp(c->word[1], "clear")) {
+        schedule_clear(&c->nano->schedule);
+        say(c, "ok");
         return;
     }
-    say(c, good ? "ok" : "err bad value");
+    if (c->words != 4 || !whole(c->word[1], &cycle))
+        why = "set_at takes a cycle, a key and a value, or clear";
+    else if (cycle < c->nano->avr->cycle)
+        why = "that cycle is past";
+    else
+        why = setting_parse(c->nano, c->word[2], c->word[3], &setting);
+    if (!why && schedule_add(&c->nano->schedule, cycle, &setting))
+        why = "too many settings are waiting";
+    say(c, why ? "err %s" : "ok", why);
+}
+
+static void do_fault(struct call *c)
+{
+    struct setting setting;
+    char key[32];
+    if (c->words != 3) {
+        say(c, "err fault takes a part and a kind");
+        return;
+    }
+    snprintf(key, sizeof key, "fault_%.20s", c->word[1]);
+    const char *why = setting_parse(c->nano, key, c->word[2], &setting);
+    if (!why)
+        setting_apply(c->nano, &setting, c->nano->avr->cycle);
+    say(c, why ? "err %s" : "ok", why);
+}
+
+static void do_swap(struct call *c)
+{
+    uint64_t a, b;
+    if (c->words != 3 || !whole(c->word[1], &a) || !whole(c->word[2], &b) || a >= LEDS_COUNT || b >= LEDS_COUNT
+        || a == b) {
+        say(c, "err swap takes two different pins, 0..5");
+        return;
+    }
+    leds_swap(&c->nano->leds, (int)a, (int)b, c->nano->avr->cycle);
+    say(c, "ok");
+}
+
+// What is lit now, and what that does to the board: emitters' mask, amperes of all, supply, rail.
+static void do_lamps(struct call *c)
+{
+    const struct lamps *l = &c->nano->leds.lamps;
+    leds_settle(&c->nano->leds, c->nano->avr->cycle);
+    say(c, "ok %d %.9g %.9g %.9g", l->on.lit, l->total_amperes, lamps_supply_at(l, c->nano->avr->cycle),
+        l->rail_volts);
 }
 
 static void do_markers(struct call *c)
@@ -248,17 +276,32 @@ static void do_markers(struct call *c)
 
 static void do_counters(struct call *c)
 {
-    const struct nano *n = c->nano;
+    struct nano *n = c->nano;
+    struct lamps *l = &n->leds.lamps;
+    if (c->words == 2 && !strcmp(c->word[1], "clear")) {
+        nano_clear_counters(n);
+        say(c, "ok");
+        return;
+    }
+    if (c->words != 1) {
+        say(c, "err counters takes nothing or clear");
+        return;
+    }
+    leds_settle(&n->leds, n->avr->cycle);
+    lamps_count(l, n->avr->cycle);
     const struct bridge *b = &c->session->bridge;
     say(c, "ok uart_overruns=%" PRIu64 " rx_garbage=%" PRIu64 " tx_garbage=%" PRIu64 " rx_bytes=%" PRIu64
         " tx_bytes=%" PRIu64 " spm_denied=%" PRIu64 " page_writes=%" PRIu64 " eeprom_writes=%" PRIu64
         " wdt_resets=%" PRIu64 " resets=%" PRIu64 " power_ons=%" PRIu64 " session=%" PRIu64
         " crashes=%" PRIu64 " host_dropped=%" PRIu64 " device_dropped=%" PRIu64 " clients=%d"
-        " conversions=%" PRIu64,
+        " conversions=%" PRIu64 " asleep_cycles=%" PRIu64 " lit_cycles_0=%" PRIu64 " lit_cycles_1=%" PRIu64
+        " lit_cycles_2=%" PRIu64 " lit_cycles_3=%" PRIu64 " lit_cycles_4=%" PRIu64 " lit_cycles_5=%" PRIu64
+        " most_lit=%u longest_pulse_cycles=%" PRIu64 " led_charge_nc=%.0f",
         n->uart.overruns, n->uart.rx_garbage, n->uart.tx_garbage, n->uart.rx_bytes, n->uart.tx_bytes,
         n->selfprog.denied, n->selfprog.page_writes, n->eeprom.writes, n->watchdog_resets, n->resets,
         n->power_ons, n->session, n->crashes, b->host_dropped, b->device_dropped, b->clients,
-        n->adc.conversions);
+        n->adc.conversions, n->asleep_cycles, l->lit_cycles[0], l->lit_cycles[1], l->lit_cycles[2],
+        l->lit_cycles[3], l->lit_cycles[4], l->lit_cycles[5], l->most_lit, l->longest_pulse, l->charge_nc);
 }
 
 // For bench tests: a node's voltage now, how it is driven, when that began or a sample was taken, and what
@@ -287,7 +330,8 @@ void command_run(struct session *session, const char *line, char *reply)
         {"time", do_time}, {"lockstep", do_lockstep}, {"advance", do_advance}, {"target", do_target},
         {"targets", do_targets}, {"follow", do_follow}, {"motion", do_motion}, {"state", do_state},
         {"truth", do_truth}, {"frames", do_frames}, {"reset", do_reset}, {"power", do_power}, {"cut", do_cut},
-        {"set", do_set}, {"markers", do_markers}, {"counters", do_counters}, {"node", do_node},
+        {"set", do_set}, {"set_at", do_set_at}, {"fault", do_fault}, {"swap", do_swap},
+        {"lamps", do_lamps}, {"markers", do_markers}, {"counters", do_counters}, {"node", do_node},
         {"quit", do_quit},
     };
     char words[LINE_BYTES], rest[LINE_BYTES];

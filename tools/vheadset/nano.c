@@ -37,6 +37,7 @@ static void run_batch(struct nano *nano)
     if (avr->state == cpu_Sleeping) {
         nano->markers.slept = true;
         avr->cycle += idle;
+        nano->asleep_cycles += idle;
         idle = avr_cycle_timer_process(avr);
     } else if (avr->state != cpu_Running) {
         // The program ran off the end or into nonsense: only the watchdog or a reset helps.
@@ -160,6 +161,19 @@ int nano_save(struct nano *nano)
     return 0;
 }
 
+static void before_cycle(void *param, uint64_t cycle)
+{
+    struct nano *nano = param;
+    schedule_run(&nano->schedule, nano, cycle);
+}
+
+void nano_clear_counters(struct nano *nano)
+{
+    leds_settle(&nano->leds, nano->avr->cycle);
+    lamps_clear(&nano->leds.lamps, nano->avr->cycle);
+    nano->asleep_cycles = 0;
+}
+
 void nano_run_until(struct nano *nano, uint64_t cycle)
 {
     avr_t *avr = nano->avr;
@@ -170,13 +184,17 @@ void nano_run_until(struct nano *nano, uint64_t cycle)
             nano->bridge->to_device.used = 0;
             if (avr->cycle < cycle)
                 avr->cycle = cycle;
+            schedule_run(&nano->schedule, nano, avr->cycle);
             return;
         }
         uint64_t limit = cycle < nano->cut_cycle ? cycle : nano->cut_cycle;
+        if (schedule_next(&nano->schedule) < limit)
+            limit = schedule_next(&nano->schedule);
         access_at(avr, limit, stop_here, nano);
         while (avr->cycle < limit && !nano->watchdog.expired)
             run_batch(nano);
         avr_cycle_timer_cancel(avr, stop_here, nano);
+        schedule_run(&nano->schedule, nano, avr->cycle);
         if (nano->watchdog.expired) {
             avr_reset(avr);
             after_reset(nano, NANO_RESET_WATCHDOG);
@@ -268,6 +286,8 @@ int nano_open(struct nano *nano, const struct config *config, struct bridge *bri
     person_init(&nano->person, config, noise_session(config->seed, nano->session));
     leds_attach(&nano->leds, avr, &nano->adc, &nano->person, nano->map, config, nano->cycles_per_true_second);
     adc_attach(&nano->adc, avr, &nano->leds, &nano->config.physics, config->seed);
+    nano->adc.before = before_cycle;
+    nano->adc.before_param = nano;
     timer1_attach(&nano->timer1, avr, &nano->adc);
     uart_attach(&nano->uart, avr, bridge, nano->cycles_per_true_second);
     markers_attach(&nano->markers, avr);

@@ -16,6 +16,7 @@
 #include "leds.h"
 #include "markers.h"
 #include "person.h"
+#include "schedule.h"
 #include "selfprog.h"
 #include "timer1.h"
 #include "uart.h"
@@ -38,12 +39,14 @@ struct nano {
     struct leds leds;
     struct person person;
     struct markers markers;
+    struct schedule schedule;
     double cycles_per_true_second;
     bool powered;
     uint64_t session;            // times the power was switched on before, ever: kept in the state folder
     uint64_t noise_seed;         // of this session
     uint8_t reset_flags;         // MCUSR, which a reset keeps
     uint64_t cut_cycle;          // power fails there; UINT64_MAX = not planned
+    uint64_t asleep_cycles;      // spent sleeping since the counters were cleared
     uint64_t resets, watchdog_resets, power_ons, crashes;
 };
 
@@ -55,6 +58,8 @@ void nano_close(struct nano *nano);
 
 // Let time pass up to a cycle (overshooting by less than one instruction while the CPU runs).
 void nano_run_until(struct nano *nano, uint64_t cycle);
+// Start the tally of lamps and sleep anew.
+void nano_clear_counters(struct nano *nano);
 // Press the reset button. No effect without power.
 void nano_press_reset(struct nano *nano);
 // Returns 0, or -1 with errno set when the images could not be saved.
