@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from .errors import DisconnectedError, VirtualError
 
+FAULTS = ("none", "open", "short", "short_ground", "covered", "finger")
 REPLY_TIMEOUT_S = 60.0          # real seconds for one answer; an `advance` computes before it answers
 
 
@@ -37,6 +38,15 @@ class Section(NamedTuple):
     least: float
     mean: float
     most: float
+
+
+class Lamps(NamedTuple):
+    """Emitters lit (their numbers), current of all (A), supply and rail under it (V)."""
+
+    lit: tuple
+    amperes: float
+    supply_volts: float
+    rail_volts: float
 
 
 class VirtualControl:
@@ -156,8 +166,44 @@ class VirtualControl:
         self.command(f"cut {int(cycle)}")
 
     def set(self, key, value):
-        """Change ambient, light, lid, ... while running."""
+        """Change ambient, ambient_na, ambient_flicker, flicker_hz, light, supply_volts, lid, ... at once."""
         self.command(f"set {key} {value}")
+
+    def set_at(self, cycle, key, value):
+        """The same at exactly this CPU cycle, in the middle of an exposure if need be."""
+        self.command(f"set_at {int(cycle)} {key} {value}")
+
+    def set_at_clear(self):
+        """Forget what set_at() still holds."""
+        self.command("set_at clear")
+
+    def ambient(self, na, flicker=0.0, hz=None):
+        """Ambient light as numbers: nA on a nominal LED, depth of flicker 0..1, its frequency (Hz)."""
+        self.set("ambient_na", f"{na:.9g}")
+        self.set("ambient_flicker", f"{flicker:.9g}")
+        if hz is not None:
+            self.set("flicker_hz", f"{hz:.9g}")
+
+    def supply(self, volts):
+        """Supply before its source resistance, 4.2 to 5.5 V."""
+        self.set("supply_volts", f"{volts:.9g}")
+
+    def fault(self, part, kind):
+        """Make part 0..5 "none", "open", "short", "short_ground", "covered" or "finger" (FAULTS).
+
+        Parts 6..8 are the emitters of the photodiode wiring: "none", "open" or "covered".
+        """
+        self.command(f"fault {part} {kind}")
+
+    def swap(self, first, second):
+        """Exchange the parts on two pins, 0..5; once more undoes it."""
+        self.command(f"swap {first} {second}")
+
+    def lamps(self):
+        """Lamps: which emitters are lit now, and what that does to the board."""
+        mask, amperes, supply, rail = self.command("lamps").split()[:4]
+        lit = tuple(i for i in range(8) if int(mask) >> i & 1)
+        return Lamps(lit, float(amperes), float(supply), float(rail))
 
     def markers(self):
         """{section: Section} of gross cycles, keys "0".."5"; keys with an n ("0n") are net of interrupts."""
@@ -171,8 +217,17 @@ class VirtualControl:
         self.command("markers clear")
 
     def counters(self):
+        """{name: count} since power-on, and of light and sleep since counters_clear().
+
+        lit_cycles_0..5, longest_pulse_cycles, asleep_cycles in CPU cycles; most_lit: emitters at once;
+        led_charge_nc: what their drivers gave, nC.
+        """
         items = (item.split("=", 1) for item in self.command("counters").split())
         return {key: int(float(value)) for key, value in items}
+
+    def counters_clear(self):
+        """Begin the tally of light and sleep anew; the other counters go on."""
+        self.command("counters clear")
 
     def frames(self, path=None):
         """Log the cycles of first release, last sample and sent delimiters to `path`; None stops."""

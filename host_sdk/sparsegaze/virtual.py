@@ -17,7 +17,7 @@ import weakref
 from pathlib import Path
 
 from . import registry
-from .control import EyeState, Section, Time, VirtualControl
+from .control import EyeState, Lamps, Section, Time, VirtualControl
 from .errors import VirtualError
 
 try:
@@ -25,8 +25,8 @@ try:
 except ImportError:             # Python < 3.11
     import tomli as tomllib
 
-__all__ = ["VirtualNano", "VirtualControl", "EyeState", "Section", "Time", "locate_vheadset",
-           "locate_bootloader"]
+__all__ = ["VirtualNano", "VirtualControl", "EyeState", "Lamps", "Section", "Time",
+           "locate_vheadset", "locate_bootloader"]
 
 SOURCE_TREE = Path(__file__).resolve().parent.parent.parent
 BOOTLOADERS = {                 # name: (start address, file, variable that names another file)
@@ -46,7 +46,7 @@ STOP_TIMEOUT_S = 5.0
 class VirtualNano:
     """Starts on construction; a context manager that stops it on leaving.
 
-    headset     path of a headset description (default: the LED2Gaze ring)
+    headset     path of a headset description (default: the LED2Gaze ring); its [board] says how it is wired
     person      seed of the simulated person
     seed        of parts, noise and behaviour; default: the person's
     unpaced     False: real time; True: its clock stands still except while a client lets it run
@@ -80,8 +80,9 @@ class VirtualNano:
             _refuse_to_replace(link)
         constants = _physics(binary, physics or {})
         reference = None
+        described = _described(headset, map)
         if map is None:
-            map, reference = _response_map(headset, person, constants["eye.lid_follow_gain"], progress)
+            map, reference = _response_map(described, person, constants["eye.lid_follow_gain"], progress)
         # Short and private: a socket's path holds 107 bytes.
         folder = Path(tempfile.mkdtemp(prefix="sgv-"))
         self._finalizer = weakref.finalize(self, _clean, folder)
@@ -99,6 +100,7 @@ class VirtualNano:
                 settings[key] = _absolute(path)
         if reference is not None:
             settings["map_reference"] = f"{reference:.17g}"
+        settings.update(_board(described))
         settings.update(constants)
         config = folder / "config"
         config.write_text("".join(f"{key} {value}\n" for key, value in settings.items()))
@@ -195,18 +197,33 @@ def locate_bootloader(name="optiboot", start=None):
 
 def _response_map(headset, person, lid_follow_gain, progress):
     """(path of the map, mean of the map that gives the nominal photocurrent)."""
-    from .headset import load_headset
     from .person import draw_person
     from . import simulate
 
     share = None if progress is None else lambda done: progress("map", done, 1.0)
     try:
-        path = simulate.response_map(load_headset(headset), draw_person(person, float(lid_follow_gain)),
+        path = simulate.response_map(headset, draw_person(person, float(lid_follow_gain)),
                                      progress=share)
     except OSError as error:
         raise VirtualError(f"the response map cannot be written ({error})",
                            "make room, or set XDG_CACHE_HOME to a directory of yours") from None
     return path, simulate.REFERENCE_MEAN
+
+
+def _described(headset, map):
+    """The headset.Headset of a file; None where a map makes up for a file that is not there."""
+    from .headset import load_headset
+
+    return None if map is not None and not headset.is_file() else load_headset(headset)
+
+
+def _board(headset):
+    """The simulator's keys for how a headset (None: the default one) is wired."""
+    board = {} if headset is None else headset.board
+    keys = {key: board[key] for key in ("wiring", "rail_volts", "rail_ohm", "rail_noise_mv") if key in board}
+    if "wiring" in board:           # else the file describes optics only
+        keys["supply_pin"] = board.get("supply_pin", "none")
+    return keys
 
 
 def _physics(binary, changes):

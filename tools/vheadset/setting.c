@@ -3,6 +3,7 @@
 
 #include <math.h>
 #include <stdbool.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -75,8 +76,12 @@ const char *setting_parse(const struct nano *nano, const char *key, const char *
         if (NUMBERS[i].name && !strcmp(key, NUMBERS[i].name)) {
             out->key = i;
             if (!real(value, NUMBERS[i].low, NUMBERS[i].high, &out->number)
-                || (i == KEY_MICROSACCADES && out->number != rint(out->number)))
-                return "bad value";
+                || (i == KEY_MICROSACCADES && out->number != rint(out->number))) {
+                static char why[80];
+                snprintf(why, sizeof why, "bad value: %s is %g to %g%s", key, NUMBERS[i].low, NUMBERS[i].high,
+                         i == KEY_LID ? ", or auto" : "");
+                return why;
+            }
             return NULL;
         }
     return "the keys are ambient, ambient_na, ambient_flicker, flicker_hz, light, supply_volts, warmer_k, "

@@ -12,7 +12,7 @@ struct setting {
     double number;           // what was given, or the index of a name
 };
 
-// Returns NULL, or why not (static text).
+// Returns NULL, or why not (text that holds until the next call).
 const char *setting_parse(const struct nano *nano, const char *key, const char *value, struct setting *out);
 // Bring the board forward to a cycle, then change it.
 void setting_apply(struct nano *nano, const struct setting *setting, uint64_t cycle);
