@@ -70,7 +70,8 @@ def check(capture, remedy=""):
         return
     counts = chosen.counts()
     causes = {
-        "flagged": "readings were saturated or starved: keep sunlight away, the headset before the eye",
+        "flagged": "readings were saturated, starved or at fault: keep sunlight away, the headset before the "
+        "eye; `sparsegaze status` names faults",
         "blink": "the signals kept jumping: blink between targets, hold the headset still",
         "unstable": "the signals kept jumping: blink between targets, hold the headset still",
         "inattentive": "the eye was elsewhere: look at each dot until it moves",
@@ -107,7 +108,8 @@ def _finish(whole, path, meta):
 def _select(part, provisional=False):
     from ._core import lib
 
-    flagged = (part.frames["raw_flags"] & (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED)) != 0
+    spoilt = lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_FAULT
+    flagged = (part.frames["raw_flags"] & spoilt) != 0
     index, onsets, targets = part.target_index, part.onset_us, part.plan.target_deg
     if provisional and len(index):
         # Only the targets that these frames belong to: a plan shorter than that knows nothing of attention.

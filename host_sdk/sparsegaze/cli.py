@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The `sparsegaze` command. Commands live in cli_device.py, cli_gaze.py and cli_stream.py.
+"""The `sparsegaze` command. Commands live in cli_*.py, each by the table below.
 
 Exit codes: 0 done; 1 failed (one line on stderr: what is wrong, and the remedy); 2 wrong usage; 130
 interrupted by Ctrl-C, 143 by SIGTERM. No traceback reaches the user; SPARSEGAZE_DEBUG=1 lets it through.
@@ -19,7 +19,7 @@ from .errors import SparsegazeError
 
 # name: (module, what it does in one line), in the order in which one uses them
 COMMANDS = {
-    "doctor": ("cli_device", "What is installed, what is missing and how to get it."),
+    "doctor": ("cli_device", "What is installed; what is wrong with a board or a headset."),
     "list": ("cli_device", "Ports and devices, virtual ones too."),
     "map": ("cli_map", "What each sensor receives over gaze, on a simulated person."),
     "view": ("cli_view", "What one sensor sees of a simulated eye, as a picture."),
@@ -27,6 +27,11 @@ COMMANDS = {
     "virtual": ("cli_device", "Run a virtual Nano: prints its port, runs until stopped."),
     "flash": ("cli_device", "Put the firmware on a board and read it back."),
     "info": ("cli_device", "Versions, limits, counters, exposures and stored models."),
+    "status": ("cli_health", "Is the board well: faults by name, with what to do."),
+    "settings": ("cli_sense", "Frame rate, averaging, power, wiring, lights."),
+    "exposure": ("cli_sense", "The six exposure times: automatic, held, set, limited."),
+    "linearity": ("cli_health", "Self-calibration of the sensors' linearity."),
+    "probe": ("cli_health", "Who sees whom: names swapped, dead and covered LEDs."),
     "calibrate": ("cli_gaze", "Targets, recording, fit, upload and validation in one go."),
     "record": ("cli_gaze", "Record raw features while targets are shown."),
     "fit": ("cli_gaze", "Make a model from a recording (no device needed)."),

@@ -17,21 +17,34 @@ port_argument = click.argument("port")
 
 
 @click.command()
+@click.argument("what", metavar="[PORT|HEADSET]", required=False)
 @json_option
-def doctor(as_json):
-    """What is installed, what is missing and how to get it.
+def doctor(what, as_json):
+    """What is installed, what is missing and how to get it. With PORT: is that board well, and why not.
 
-    Exit code 1 when something is missing without which flashing, calibrating or streaming fails.
+    With HEADSET, a description in TOML: is it safe for the eye, and what current does it draw. Exit code 1
+    when something is wrong, or is missing without which flashing, calibrating or streaming fails.
 
     \b
     Example:
         sparsegaze doctor
+        sparsegaze doctor /dev/ttyUSB0
+        sparsegaze doctor headsets/led2gaze.toml
     """
-    from .doctor import examine
+    if what is None:
+        from .doctor import examine
 
-    checks = examine()
+        checks, bad, unsure = examine(), "MISSING", "optional"
+    elif what.endswith(".toml"):
+        from .cli_headset import examine
+
+        checks, bad, unsure = examine(what), "UNSAFE", "note"
+    else:
+        from .doctor_port import examine
+
+        checks, bad, unsure = examine(what), "FAULT", "note"
     good = all(check.ok is not False for check in checks)
-    mark = {True: "ok", None: "optional", False: "MISSING"}
+    mark = {True: "ok", None: unsure, False: bad}
     lines = []
     for check in checks:
         lines.append(f"{mark[check.ok]:<9} {check.name}: {check.found}")
@@ -223,12 +236,15 @@ def info(port, as_json):
     Example:
         sparsegaze info /dev/ttyUSB0 --json
     """
+    from . import faults
+    from .cli_health import COUNTERS, fault_report
+    from .cli_sense import settings_report
     from .device import Device
     from .wire import lib
 
     with Device(port) as device:
         hello, status, models = device.hello, device.status(), device.model_info()
-        exposure, recentre = device.exposure(), device.recentre()
+        exposure, recentre, settings = device.exposure(), device.recentre(), device.settings()
         clock = device.sync_clock(4)
     slots = []
     for slot, name in ((lib.SG_SLOT_A, "A"), (lib.SG_SLOT_B, "B"), (lib.SG_SLOT_RAM, "trial")):
@@ -244,21 +260,8 @@ def info(port, as_json):
                 "channels": models.channels[slot] if valid else None,
             }
         )
-    counters = {
-        name: getattr(status, name)
-        for name in (
-            "late_frames",
-            "late_slots",
-            "tx_dropped",
-            "rx_bad",
-            "rx_rejected",
-            "rx_overrun",
-            "saturated",
-            "starved",
-            "exposure_changes",
-            "eeprom_writes",
-        )
-    }
+    counters = {name: getattr(status, name) for name in COUNTERS}
+    found = faults.of(status, port)
     data = {
         "port": port,
         "board": hello.board_text,
@@ -267,8 +270,11 @@ def info(port, as_json):
         "model_version": hello.model_version,
         "channels": hello.channels,
         "cpu_hz": hello.cpu_hz,
-        "frame_period_us": hello.frame_period_us,
-        "rate_hz": 1e6 / hello.frame_period_us,
+        "frame_period_us": settings.frame_period_us,
+        "rate_hz": settings.frame_hz,
+        "settings": settings_report(settings),
+        "faults": fault_report(found),
+        "supply_volts": status.supply_volts,
         "exposure_limits_us": [hello.exposure_min_us, hello.exposure_max_us],
         "slot_bytes": hello.slot_bytes,
         "trial_bytes": hello.trial_bytes,
@@ -291,7 +297,12 @@ def info(port, as_json):
                 "firmware",
                 f"{data['firmware']}, protocol {hello.wire_version}, model format " f"{hello.model_version}",
             ),
-            ("frames", f"{data['rate_hz']:.1f} Hz, {hello.channels} channels"),
+            (
+                "frames",
+                f"{settings.frame_hz:.1f} Hz (at most {settings.rate_limit_hz}), {hello.channels} channels, "
+                f"wired as {settings.wiring_text}",
+            ),
+            ("faults", "; ".join(fault.text for fault in found) or "none"),
             (
                 "exposures",
                 " ".join(f"{v:.2f}" for v in exposure.exposure_us) + f" us ({hello.exposure_min_us}.."

@@ -16,6 +16,8 @@ STAGES = {
     "fit": "fitting the model",
     "exposures": "waiting for the exposures to settle",
     "recentre": "look at the dot",
+    "linearity": "alternating the exposures",
+    "probe": "lighting one LED at a time",
     "press reset": "press the board's reset button now",
 }
 

@@ -5,8 +5,9 @@ Columns: t_us (device time, mean sample time), host_time_s (when it arrived), se
 (exact multiples of 1/128 deg; nan where no gaze came), flags (bits of enum sg_flag), s0..s5 (features),
 recentre_az_deg, recentre_el_deg, recentre_az_az, recentre_az_el, recentre_el_az, recentre_el_el (the
 correction included in the gaze: offset, and gains in multiples of 1/512), sigma_deg (standard deviation by
-the model's own account; nan where it gives none). `replay` computes the gaze of such a file again and
-compares the bits.
+the model's own account; nan where it gives none). With counts also lit0..5 and unlit0..5, converter codes of
+the frame's last cycle with our light and without (nothing where none came), and exposure0_us..5, of both.
+`replay` computes the gaze of such a file again and compares the bits.
 """
 
 import os
@@ -33,15 +34,23 @@ COLUMNS = (
 )
 
 
+COUNT_COLUMNS = (
+    *(f"lit{i}" for i in range(6)),
+    *(f"unlit{i}" for i in range(6)),
+    *(f"exposure{i}_us" for i in range(6)),
+)
+
+
 class GazeCsv:
     """Writes a stream's CSV while it arrives, in whole lines. A context manager.
 
-    path  file name, or an open text file (then not closed here).  Raises RecordingError; BrokenPipeError of a
-          pipe.
+    path    file name, or an open text file (then not closed here);  counts: frames have counts, keep them
+    Raises RecordingError; BrokenPipeError of a pipe.
     """
 
-    def __init__(self, path, meta=None, flush_rows=64):
+    def __init__(self, path, meta=None, flush_rows=64, counts=False):
         self.rows, self._flush_rows, self._lines, self._crc = 0, flush_rows, [], None
+        self._counts = counts
         self._owned = not hasattr(path, "write")
         self.path = os.fspath(path) if self._owned else getattr(path, "name", "the output")
         try:
@@ -50,7 +59,7 @@ class GazeCsv:
             raise self._unwritable(error) from None
         for key, value in (meta or {}).items():
             self._lines.append(f"# {key}: {' '.join(str(value).split())}\n")
-        self._lines.append(",".join(COLUMNS) + "\n")
+        self._lines.append(",".join(COLUMNS + COUNT_COLUMNS * counts) + "\n")
         self.flush()
 
     def add(self, frame):
@@ -67,7 +76,7 @@ class GazeCsv:
             else f"nan,nan,{raw.flags}"
         )
         self._lines.append(
-            "%d,%.6f,%d,%s,%s,%.7f,%.7f,%.9f,%.9f,%.9f,%.9f,%s\n"
+            "%d,%.6f,%d,%s,%s,%.7f,%.7f,%.9f,%.9f,%.9f,%.9f,%s%s\n"
             % (
                 frame.t_us,
                 frame.host_time,
@@ -77,6 +86,7 @@ class GazeCsv:
                 *(value / DEG_Q7 for value in raw.recentre.offset_deg_q7),
                 *(value / GAIN_Q9 for value in raw.recentre.gain_q9),
                 f"{gaze.sigma_deg:.6g}" if gaze is not None else "nan",
+                _counts(frame.counts) if self._counts else "",
             )
         )
         self.rows += 1
@@ -113,3 +123,10 @@ class GazeCsv:
         return RecordingError(
             f"cannot write {self.path}: {error.strerror}", "choose another place with --csv"
         )
+
+
+def _counts(counts):
+    if counts is None:
+        return "," * len(COUNT_COLUMNS)
+    values = (*counts.lit_code, *counts.unlit_code, *("%.4f" % us for us in counts.exposure_us))
+    return "".join(",%s" % value for value in values)

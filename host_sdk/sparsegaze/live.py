@@ -9,7 +9,7 @@ class Tally:
     """Counts of a stream: frames, valid, lost, incomplete, bad; rate in device time."""
 
     def __init__(self):
-        self.frames = self.valid = self.lost = self.incomplete = self.bad = 0
+        self.frames = self.valid = self.lost = self.incomplete = self.bad = self.faulty = 0
         self.first_us = self.last_us = None
         self.gaze = None  # the latest, valid or not
         self.without_model = 0
@@ -23,6 +23,7 @@ class Tally:
         self.gaze = frame.gaze
         self.valid += frame.gaze is not None and frame.gaze.valid
         self.without_model += frame.gaze is not None and bool(frame.gaze.flags & lib.SG_FLAG_NO_MODEL)
+        self.faulty += frame.gaze is not None and bool(frame.gaze.flags & lib.SG_FLAG_FAULT)
         self.lost, self.incomplete, self.bad = device.lost, device.incomplete, device.bad
         self.clock_drift = device.clock.drift
 
@@ -43,9 +44,20 @@ class Tally:
         elif self.gaze.valid:
             where = f"azimuth {self.gaze.azimuth_deg:+7.2f}  elevation {self.gaze.elevation_deg:+7.2f} deg"
         else:
-            why = "the device has no model" if self.without_model == self.frames else "blink, or a headset that moved"
-            where = f"no valid gaze ({why})".ljust(42)
+            where = f"no valid gaze ({self._why()})".ljust(42)
         return f"{where}   {self.rate_hz:6.1f} Hz   {self.seconds:7.1f} s   lost {self.lost}"
+
+    def _why(self):
+        flags = self.gaze.flags
+        if self.without_model == self.frames:
+            return "the device has no model"
+        if flags & lib.SG_FLAG_FAULT:
+            return "a fault: see sparsegaze status"
+        if flags & lib.SG_FLAG_SATURATED:
+            return "too much light"
+        if flags & lib.SG_FLAG_STARVED:
+            return "too little light"
+        return "blink, or a headset that moved"
 
     def report(self):
         """Plain numbers."""
@@ -57,21 +69,22 @@ class Tally:
             "incomplete": self.incomplete,
             "bad_crc": self.bad,
             "valid": self.valid,
+            "faulty": self.faulty,
             "valid_percent": 100.0 * self.valid / self.frames if self.frames else 0.0,
             "clock_drift_ppm": self.clock_drift * 1e6,
         }
 
 
-def run(device, tally, seconds=None, csv=None, shown=None):
+def run(device, tally, seconds=None, csv=None, shown=None, counts=False):
     """Stream from an open device until `seconds` of device time have passed (None: until interrupted).
 
     tally  Tally to keep up to date; csv: path or open text file for every frame; shown: called after every
-           frame
+           frame; counts: also what the converter read, in the CSV
     The CSV is complete whatever ends the stream. Raises NoDeviceError, DisconnectedError, RecordingError.
     """
-    writer = None if csv is None else GazeCsv(csv)
+    writer = None if csv is None else GazeCsv(csv, counts=counts)
     try:
-        device.set_stream(raw=writer is not None, gaze=True)
+        device.set_stream(raw=writer is not None, gaze=True, counts=counts and writer is not None)
         for frame in device.frames():
             if (
                 seconds is not None

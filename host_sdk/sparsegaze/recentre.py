@@ -12,6 +12,7 @@ import numpy as np
 
 from . import correction
 from .errors import CalibrationError
+from .sensing import wait_stored
 
 SETTLE_S = 0.6  # for the eye to get there
 COLLECT_S = 0.7
@@ -19,7 +20,7 @@ LIMIT_S = 6.0  # in all, for eyes that blink
 LEAST_FRAMES = 60
 SPREAD_LIMIT_DEG = 2.0  # a gaze that wanders more was not resting on the point
 OFFSET_LIMIT_DEG = 30.0
-STORE_S, STORE_LIMIT_S = 0.25, 1.5  # one record in EEPROM takes about 0.2 s
+STORE_LIMIT_S = 1.5  # one record in EEPROM takes about 0.2 s
 NO_GAIN = ((0.0, 0.0), (0.0, 0.0))
 
 
@@ -130,12 +131,9 @@ def keep(device, offset_deg=None, gain=None):
     The device writes its live state byte by byte beside its other work; a reset meanwhile would lose it.
     Returns the Recentre in force.
     """
-    written, link = device.status().eeprom_writes, device.link
+    written = device.status().eeprom_writes
     after = device.recentre(offset_deg, gain, clear=offset_deg is None)
-    deadline = link.now() + STORE_LIMIT_S
-    while device.status().eeprom_writes == written and link.now() < deadline:
-        link.sleep(0.02)
-    link.sleep(STORE_S)  # the record counted may have been an earlier one, still under way
+    wait_stored(device, written, STORE_LIMIT_S)
     return after
 
 

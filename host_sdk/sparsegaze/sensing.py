@@ -1,8 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the device senses: exposures, timing, what is on the pins, the curves of its channels, single emitters."""
+"""How the device senses: exposures, timing, what is on the pins, its channels' curves, single emitters."""
 
 from . import wire
 from .wire import Curve, Exposure, Probe, Settings, lib
+
+
+STORE_S = 0.25                  # a record in EEPROM takes less than this
+STORE_LIMIT_S = 4.0             # exposures are stored once they have rested for two seconds
+
+
+def wait_stored(device, written, limit_s=STORE_LIMIT_S):
+    """Wait until a device has stored its live state, at most limit_s.
+
+    written   device.status().eeprom_writes from before the change. The device writes byte by byte beside its
+              other work; a reset meanwhile (another program opens the port) would lose the change.
+    """
+    link = device.link
+    deadline = link.now() + limit_s
+    while device.status().eeprom_writes == written and link.now() < deadline:
+        link.sleep(0.02)
+    link.sleep(STORE_S)     # the record counted may have been an earlier one, still under way
 
 
 class Sensing:

@@ -11,9 +11,9 @@ import numpy as np
 
 from sparsegaze import replay, wire
 from sparsegaze.device import Frame
-from sparsegaze.errors import DisconnectedError
+from sparsegaze.errors import DeviceError, DisconnectedError
 from sparsegaze.model import DeviceModel
-from sparsegaze.wire import Gaze, Raw, Recentre, lib
+from sparsegaze.wire import Curve, Exposure, Gaze, Probe, Raw, Recentre, Settings, Status, lib
 
 FRAME_US = 3840
 OPTICS = np.array(
@@ -94,6 +94,8 @@ class FakeDevice:
     blinks      [(begin_us, end_us)];  raw_flags: function t_us -> flags
     unplug_us   the cable is pulled then;  interrupt_us: Ctrl-C then;  drop: sequence numbers that get lost
     spoil       function (seq, Gaze) -> Gaze, for gazes that the host would not compute
+    frame_us    from frame to frame;  limit_hz  that settings reach;  fault [6], alarm, supply_mv of status
+    refuse      names of settings that are refused;  see  6 x 6 octaves of probes, None: too little
     """
 
     def __init__(
@@ -109,6 +111,13 @@ class FakeDevice:
         drop=(),
         spoil=None,
         seed=0,
+        frame_us=FRAME_US,
+        limit_hz=1001,
+        fault=(0,) * 6,
+        alarm=0,
+        supply_mv=5000,
+        refuse=(),
+        see=None,
     ):
         self.model, self.noise, self.shift, self.blinks = (
             model,
@@ -123,7 +132,24 @@ class FakeDevice:
         self.schedule, self.t_us, self.seq = [], 2_000_000, 500
         self.link = SimpleNamespace(control=None, now=lambda: self.t_us * 1e-6, sleep=self._sleep)
         self.stored_us = None
-        self.hello = SimpleNamespace(board_text="fake board", firmware_text="0.0.0")
+        self.hello = SimpleNamespace(
+            board_text="fake board",
+            firmware_text="0.0.0",
+            wire_version=lib.SG_WIRE_VERSION,
+            model_version=lib.SG_MODEL_VERSION,
+            channels=6,
+            cpu_hz=16_000_000,
+            exposure_min_us=4,
+            exposure_max_us=330,
+            slot_bytes=3072,
+            trial_bytes=640,
+        )
+        self.port, self.baud = "/dev/fake", 1_000_000
+        self.frame_us, self.limit_hz, self.refuse, self.see = frame_us, limit_hz, set(refuse), see
+        self.fault, self.alarm, self.supply_mv = tuple(fault), alarm, supply_mv
+        self.sensing = {"rate_hz": 0, "repeats": 1, "wiring": 0, "power": 0, "rolling": 0, "lights": 1}
+        self.exposures, self.automatic, self.limits = (800,) * 6, True, None     # 1/16 us
+        self.curves = (0,) * 6                                                   # 1/1024
         self.clock = SimpleNamespace(drift=0.0)
         self.affine = wire.affine((0, 0))
         self.stream, self.lost, self.bad, self.incomplete = [], 0, 0, 0
@@ -139,7 +165,7 @@ class FakeDevice:
         return Pong(self.t_us, self.t_us)
 
     def set_stream(self, raw=False, gaze=False, counts=False):
-        self.stream.append((raw, gaze))
+        self.stream.append((raw, gaze, counts))
 
     def _sleep(self, seconds):
         self.t_us += int(seconds * 1e6)
@@ -147,10 +173,78 @@ class FakeDevice:
     def status(self):
         """The record of a change counts as written 0.2 s after it."""
         done = self.stored_us is not None and self.t_us >= self.stored_us
-        return SimpleNamespace(eeprom_writes=3 + done)
+        zero = {name: 0 for name in Status._fields}
+        return Status(**{
+            **zero,
+            "t_us": self.t_us,
+            "exposure_us_q4": self.exposures,
+            "exposure_auto": int(self.automatic),
+            "eeprom_writes": 3 + done,
+            "fault": self.fault,
+            "alarm": self.alarm | (0 if self.sensing["lights"] else lib.SG_ALARM_LIGHTS_OFF),
+            "supply_mv": self.supply_mv,
+            "reset_cause": lib.SG_RESET_EXTERNAL,
+            "boot_count": 7,
+        })
 
     def model_info(self):
-        return SimpleNamespace(active=lib.SG_SLOT_A if self.model else lib.SG_SLOT_NONE)
+        image, none = self.model, lib.SG_E_MAGIC
+        return SimpleNamespace(
+            active=lib.SG_SLOT_A if image else lib.SG_SLOT_NONE,
+            verdict=(lib.SG_OK if image else none, none, none),
+            crc=(image.crc if image else 0, 0, 0),
+            generation=(1, 0, 0),
+            vectors=(image.vectors if image else 0, 0, 0),
+            channels=(6, 0, 0),
+        )
+
+    def sync_clock(self, n=8):
+        return SimpleNamespace(round_trip_s=0.001, drift=0.0)
+
+    def set_baud(self, baud):
+        self.baud = baud
+
+    def _changed(self):
+        self.stored_us = self.t_us + 200_000
+
+    def settings(self, **wanted):
+        """As sensing.Sensing.settings; the rate in force is the one wanted, or the limit."""
+        values = {name: value for name, value in wanted.items() if value is not None}
+        for name, words in (("wiring", wire.WIRINGS), ("power", wire.POWERS)):
+            if name in values:
+                values[name] = words[values[name]]
+        if self.refuse & set(values):
+            raise DeviceError(lib.SG_E_ARG, "the device refused request 0x0F: an argument is out of range")
+        self.sensing.update({name: int(value) for name, value in values.items()})
+        if values:
+            self._changed()
+        limit = self.limit_hz // self.sensing["repeats"]
+        rate = min(self.sensing["rate_hz"] or limit, limit)
+        return Settings(rate, limit, 999, round(1e6 / rate), 0, *(self.sensing[name] for name in (
+            "repeats", "wiring", "power", "rolling", "lights")))
+
+    def exposure(self, us=None, auto=None, limit_us=None):
+        if us is not None:
+            most = 16 * self.hello.exposure_max_us
+            self.exposures = tuple(min(max(int(round(16 * v)), 64), most) for v in us)
+            self.automatic = False
+        if limit_us is not None:
+            self.limits = tuple(limit_us)
+        if auto is not None:
+            self.automatic = auto
+        if us is not None or limit_us is not None or auto is not None:
+            self._changed()
+        return Exposure(self.exposures, lib.SG_EXPOSURE_AUTO if self.automatic else lib.SG_EXPOSURE_HOLD, 0)
+
+    def curve(self, curve=None):
+        if curve is not None:
+            self.curves = tuple(int(round(1024 * v)) for v in curve)
+            self._changed()
+        return Curve(self.curves, 0, 0)
+
+    def probe(self, emitter):
+        column = [None] * 6 if self.see is None else [row[emitter] for row in self.see]
+        return Probe(tuple(0 if v is None else int(round(4096 * v)) for v in column), emitter, 0)
 
     def read_model(self, slot=None):
         return self.model.image
@@ -172,9 +266,9 @@ class FakeDevice:
         return np.array(now) + self.shift
 
     def frames(self, timeout_s=2.0):
-        raw_on, gaze_on = self.stream[-1]
+        raw_on, gaze_on, counts_on = self.stream[-1]
         while True:
-            self.t_us += FRAME_US
+            self.t_us += self.frame_us
             self.seq += 1
             if self.unplug_us is not None and self.t_us >= self.unplug_us:
                 raise DisconnectedError("/dev/fake is gone", "check the cable")
@@ -186,7 +280,7 @@ class FakeDevice:
             signal = MIDDLE + OPTICS @ self.warp @ self.eye_deg(self.t_us) + self.rng.normal(0, self.noise, 6)
             if any(begin <= self.t_us < end for begin, end in self.blinks):
                 signal += 1500
-            feature = np.clip(np.round(signal), 0, 65535).astype(np.uint16)
+            feature, counts = self.sense(signal)
             flags = self.raw_flags(self.t_us)
             q7, gaze_flags, sigma = replay.infer(
                 self.model,
@@ -205,5 +299,9 @@ class FakeDevice:
                 self.t_us * 1e-6 + 5.0,
                 raw if raw_on else None,
                 gaze if gaze_on else None,
-                None,
+                counts if counts_on else None,
             )
+
+    def sense(self, signal):
+        """(features, Counts or None) of the light, given as features [6]."""
+        return np.clip(np.round(signal), 0, 65535).astype(np.uint16), None

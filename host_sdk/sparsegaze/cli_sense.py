@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands about how the device senses: settings, exposure."""
+
+import click
+
+from .cli_device import json_option, port_argument
+from .console import Console, pairs
+
+CHANNELS = 6
+
+
+class Rate(click.ParamType):
+    """Frames a second, or the word max."""
+
+    name = "HZ"
+
+    def convert(self, value, param, ctx):
+        if isinstance(value, int):
+            return value
+        if value.strip().lower() == "max":
+            return 0
+        from .wire import lib
+
+        least = lib.SG_WIRE_RATE_LEAST_HZ
+        try:
+            rate = int(value)
+        except ValueError:
+            rate = 0
+        if not least <= rate <= 65535:
+            self.fail(f"{value!r} is neither a whole number of at least {least} nor max", param, ctx)
+        return rate
+
+
+class Microseconds(click.ParamType):
+    """One number for all channels, or six with commas."""
+
+    name = "US[,US...]"
+
+    def convert(self, value, param, ctx):
+        if isinstance(value, tuple):
+            return value
+        try:
+            numbers = tuple(float(part) for part in value.split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) not in (1, CHANNELS) or not all(0 < number < 4096 for number in numbers):
+            self.fail(
+                f"{value!r} is neither one number of microseconds nor {CHANNELS} with commas", param, ctx
+            )
+        return numbers * (CHANNELS // len(numbers))
+
+
+def settings_report(now):
+    """A wire.Settings as plain values."""
+    return {
+        "rate_hz": now.frame_hz,
+        "rate_limit_hz": now.rate_limit_hz,
+        "repeats": now.repeats,
+        "period_us": now.period_us,
+        "frame_period_us": now.frame_period_us,
+        "wiring": now.wiring_text,
+        "power": now.power_text,
+        "rolling": bool(now.rolling),
+        "lights": bool(now.lights),
+    }
+
+
+def settings_lines(now, vectors):
+    """A wire.Settings in words; vectors of the model in use, 0: none."""
+    with_model = f"the model of {vectors} vectors" if vectors else "no model"
+    cycles = "1 cycle" if now.repeats == 1 else f"the mean of {now.repeats} cycles"
+    return pairs(
+        [
+            ("rate", f"{now.frame_hz:.1f} Hz (at most {now.rate_limit_hz} Hz with {with_model})"),
+            ("frame", f"{cycles} of {now.period_us} us, every {now.frame_period_us} us"),
+            ("wiring", now.wiring_text),
+            ("power", now.power_text),
+            ("rolling", "a gaze after every pair of sensors" if now.rolling else "off: one gaze a frame"),
+            ("lights", "on" if now.lights else "OFF"),
+        ]
+    )
+
+
+@click.command()
+@port_argument
+@click.option("--rate", type=Rate(), help="Frames a second, or max: as fast as can be.")
+@click.option(
+    "--repeats",
+    type=click.Choice(["1", "2", "4", "8", "16"]),
+    help="Sensing cycles averaged into a frame: less noise, lower rate.",
+)
+@click.option("--power", type=click.Choice(["normal", "low"]), help="low: sleep more, light less.")
+@click.option(
+    "--wiring",
+    type=click.Choice(["leds", "photodiodes"]),
+    help="What is on the pins: LEDs that sense and emit, or photodiodes and emitters of their own.",
+)
+@click.option("--rolling/--no-rolling", default=None, help="A gaze after every two sensors, three a cycle.")
+@click.option("--lights", type=click.Choice(["on", "off"]), help="off: no LED is lit until switched on.")
+@json_option
+def settings(port, rate, repeats, power, wiring, rolling, lights, as_json):
+    """How the device at PORT senses: frame rate, averaging, power, wiring, lights. Without options: shows it.
+
+    What can be reached depends on the model: the device computes its own limit. Settings survive a restart.
+
+    \b
+    Example:
+        sparsegaze settings /dev/ttyUSB0
+        sparsegaze settings /dev/ttyUSB0 --rate max --repeats 1
+        sparsegaze settings /dev/ttyUSB0 --rate 250 --power low
+    """
+    from .device import Device
+
+    wanted = {
+        "rate_hz": rate,
+        "repeats": None if repeats is None else int(repeats),
+        "power": power,
+        "wiring": wiring,
+        "rolling": rolling,
+        "lights": None if lights is None else lights == "on",
+    }
+    wanted = {name: value for name, value in wanted.items() if value is not None}
+    if wanted.get("rolling") and wanted.get("repeats", 1) != 1:
+        raise click.UsageError("--rolling shows single cycles: it goes with --repeats 1 only")
+    with Device(port) as device:
+        now, vectors = change(device, port, wanted)
+    Console(as_json).result({**settings_report(now), "n_vectors": vectors}, *settings_lines(now, vectors))
+
+
+def change(device, port, wanted):
+    """Apply settings to an open device, all or none: (wire.Settings in force, vectors of the model in use).
+
+    Raises SparsegazeError naming the limit when the device cannot do what is asked.
+    """
+    from .errors import DeviceError, SparsegazeError
+    from .sensing import wait_stored
+    from .wire import lib
+
+    info = device.model_info()
+    vectors = info.vectors[info.active] if info.active <= lib.SG_SLOT_RAM else 0
+    before, written = device.settings(), device.status().eeprom_writes
+    if not wanted:
+        return before, vectors
+    if wanted.get("rolling") and wanted.get("repeats", before.repeats) != 1:
+        raise SparsegazeError(
+            f"a frame is the mean of {before.repeats} cycles, and rolling output shows single ones",
+            f"sparsegaze settings {port} --rolling --repeats 1",
+        )
+    try:
+        now = device.settings(**wanted)
+    except DeviceError as error:
+        if error.code not in (lib.SG_E_ARG, lib.SG_E_RANGE, lib.SG_E_STATE):
+            raise
+        asked = ", ".join(f"{name.replace('_hz', '')} {value}" for name, value in wanted.items())
+        raise SparsegazeError(
+            f"the device refuses {asked}; it can do at most {before.rate_limit_hz} Hz now",
+            "ask for less, or for one thing at a time; nothing was changed",
+        ) from None
+    rate = wanted.get("rate_hz", 0)
+    differs = [
+        name
+        for name in ("repeats", "rolling", "lights")
+        if name in wanted and getattr(now, name) != wanted[name]
+    ]
+    if rate > now.rate_hz + max(1, rate // 200) or differs:
+        limit, repeats = now.rate_limit_hz, now.repeats
+        _restore(device, before)
+        if differs:
+            raise SparsegazeError(
+                f"this firmware does not do {differs[0]} {wanted[differs[0]]}", "nothing was changed"
+            )
+        model = f"a model of {vectors} vectors" if vectors else "no model"
+        cycles = "one cycle" if repeats == 1 else f"{repeats} cycles"
+        remedy = f"sparsegaze settings {port} --rate {limit}"
+        if repeats > 1:
+            remedy += ", or fewer --repeats"
+        elif vectors:
+            remedy += ", or calibrate with fewer --vectors"
+        raise SparsegazeError(
+            f"{rate} Hz is too fast: with {model} and {cycles} a frame this device does at most {limit} Hz",
+            remedy,
+        )
+    wait_stored(device, written)
+    return now, vectors
+
+
+def _restore(device, before):
+    device.settings(
+        rate_hz=0 if before.rate_hz >= before.rate_limit_hz else before.rate_hz,
+        repeats=before.repeats,
+        power=before.power_text,
+        wiring=before.wiring_text,
+        rolling=before.rolling,
+        lights=before.lights,
+    )
+
+
+@click.command()
+@port_argument
+@click.option("--auto", "mode", flag_value="auto", help="Adapt them to the light: a new board's way.")
+@click.option("--hold", "mode", flag_value="hold", help="Stay at those in force.")
+@click.option("--set", "fixed", type=Microseconds(), help="Hold these: one number for all, or six.")
+@click.option("--limit", type=Microseconds(), help="Automatic exposure stays at or below these.")
+@json_option
+def exposure(port, mode, fixed, limit, as_json):
+    """The six exposure times of the device at PORT, in microseconds. Without options: shows them.
+
+    The device keeps them, and what is asked of them here, through a restart. It clips them to what board and
+    frame rate allow; steps are 1/16 us.
+
+    \b
+    Example:
+        sparsegaze exposure /dev/ttyUSB0
+        sparsegaze exposure /dev/ttyUSB0 --set 40,40,55.5,60,40,40
+        sparsegaze exposure /dev/ttyUSB0 --auto --limit 90
+    """
+    from .device import Device
+    from .sensing import wait_stored
+
+    if mode and fixed:
+        raise click.UsageError(f"--{mode} and --set exclude each other")
+    if mode == "hold" and limit:
+        raise click.UsageError("--limit is about automatic exposure: it does not go with --hold")
+    with Device(port) as device:
+        written = device.status().eeprom_writes
+        if limit:
+            device.exposure(limit_us=limit)
+        if fixed:
+            device.exposure(us=fixed)
+        elif mode:
+            device.exposure(auto=mode == "auto")
+        now, hello = device.exposure(), device.hello
+        if limit or fixed or mode:
+            wait_stored(device, written)
+    clipped = fixed is not None and any(abs(a - b) > 0.05 * b for a, b in zip(now.exposure_us, fixed))
+    console = Console(as_json)
+    data = {
+        "exposure_us": list(now.exposure_us),
+        "automatic": now.automatic,
+        "least_us": hello.exposure_min_us,
+        "most_us": hello.exposure_max_us,
+        "clipped": clipped,
+    }
+    mode = "automatic" if now.automatic else "held"
+    console.result(
+        data,
+        *pairs(
+            [
+                ("exposures", " ".join(f"{value:.2f}" for value in now.exposure_us) + f" us, {mode}"),
+                ("limits", f"{hello.exposure_min_us} to {hello.exposure_max_us} us, less at a high rate"),
+            ]
+        ),
+    )
+    if clipped:
+        console.warn("the device moved the exposures to what it can do at this frame rate")
+
+
+COMMANDS = {"settings": settings, "exposure": exposure}

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Is a board well: what it says of itself, as the lines of an examination."""
+
+from . import faults
+from .doctor import Check
+from .errors import SparsegazeError
+
+SETTLE_S = 1.5  # after a reset: exposures find their level, faults show
+
+
+def examine(port):
+    """The checks of the board behind `port`, a list of doctor.Check; what is wrong is among them."""
+    from .device import Device
+
+    try:
+        with Device(port) as device:
+            device.link.sleep(SETTLE_S)
+            return checks_of(device, port)
+    except SparsegazeError as error:
+        return [Check("board", False, error.message, error.remedy)]
+
+
+def checks_of(device, port):
+    """The checks of an open device."""
+    from .wire import lib
+
+    hello, status, settings, info = device.hello, device.status(), device.settings(), device.model_info()
+    found = faults.of(status, port)
+    checks = [Check("board", True, f"{hello.board_text}, firmware {hello.firmware_text}")]
+    checks.append(_supply(status, found))
+    dark = [fault for fault in found if fault.name in faults.BOARD]
+    checks += [Check("lights", False, fault.text, fault.remedy) for fault in dark]
+    channels = [fault for fault in found if fault.channel is not None]
+    checks += [Check(f"sensor {fault.channel}", False, fault.text, fault.remedy) for fault in channels]
+    if not channels:
+        checks.append(Check("sensors", True, "all six read"))
+    if info.active == lib.SG_SLOT_NONE:
+        checks.append(Check("model", None, "none", f"sparsegaze calibrate {port}"))
+    else:
+        checks.append(Check("model", True, f"{info.vectors[info.active]} vectors"))
+    late = status.late_frames or status.late_slots or status.tx_dropped
+    rate = f"{settings.frame_hz:.1f} Hz of at most {settings.rate_limit_hz}"
+    if late:
+        said = f"frames: {status.late_frames} late, {status.tx_dropped} not sent; readings: {status.late_slots} late"
+        checks.append(Check("rate", None, f"{rate}; {said}", f"sparsegaze settings {port} --rate max"))
+    else:
+        checks.append(Check("rate", True, f"{rate}, nothing late"))
+    bad = status.rx_bad + status.rx_overrun
+    checks.append(
+        Check("line", None, f"{bad} damaged requests", "use a shorter USB cable, or --baud 500000")
+        if bad
+        else Check("line", True, "no damaged request")
+    )
+    if status.reset_cause & (lib.SG_RESET_BROWNOUT | lib.SG_RESET_WATCHDOG):
+        weak = status.reset_cause & lib.SG_RESET_BROWNOUT
+        remedy = "use another USB port" if weak else f"sparsegaze flash {port}"
+        checks.append(Check("last start", None, f"by {status.reset_text}", remedy))
+    return checks
+
+
+def _supply(status, found):
+    for fault in found:
+        if fault.name == "supply":
+            return Check("supply", False, fault.text, fault.remedy)
+    if status.supply_volts is None:
+        return Check("supply", None, "not measured", "wire the divider to A7; only to watch the voltage")
+    return Check("supply", True, f"{status.supply_volts:.2f} V")

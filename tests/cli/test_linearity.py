@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Self-calibration of linearity: finds the curves past a drifting eye and ambient light; refuses bad light."""
+
+import numpy as np
+import pytest
+from bent_sensor import BentSensor
+
+from sparsegaze import linearity
+from sparsegaze.errors import CalibrationError
+from sparsegaze.wire import lib
+
+BEND = np.array([0.020, -0.015, 0.05, 0.0, -0.04, 0.01])
+
+
+def drift(t_us):
+    """An eye that drifts a degree a second to and fro, and jumps a third of a degree 1.6 times a second."""
+    t = t_us * 1e-6
+    jump = 0.33 * (int(t * 1.6) * 7919 % 5 - 2) / 2
+    return (abs((t % 4.0) - 2.0) + jump, 0.5 * np.sin(1.3 * t))
+
+
+def unchanged(device):
+    """Curves, exposures and settings are as they were."""
+    assert device.curves == (0,) * 6 and device.automatic and device.sensing["repeats"] == 1
+    assert device.stream[-1] == (False, False, False)
+
+
+@pytest.mark.parametrize("wander", [None, drift], ids=["resting eye", "drifting eye"])
+@pytest.mark.parametrize("ambient", [0.0, 4.0], ids=["dark", "bright"])
+def test_finds_every_curve_and_takes_the_shift_away(wander, ambient):
+    device = BentSensor(BEND, wander=wander, ambient=lambda t_us: ambient, frame_us=1999)
+    done = linearity.run(device)
+    assert done.kept and np.abs(done.curve - BEND).max() < 0.004
+    assert np.abs(np.array(device.curves) / 1024 - done.curve).max() < 1e-9
+    # Of 600 codes to 150, and of as much more as the light around brings, to first order.
+    wanted = BEND * (600 + 2 * 50 * ambient) / 1024 * 0.75 / np.log(2)
+    assert np.abs(done.before - wanted).max() < 0.25 * np.abs(wanted).max()
+    assert np.abs(done.after).max() < 0.003 < np.abs(done.before).max()
+    assert device.automatic and device.stream[-1] == (False, False, False)
+
+
+def test_starts_from_the_curve_in_force_and_is_then_content():
+    device = BentSensor(BEND, frame_us=1999)
+    device.curve(BEND)
+    done = linearity.run(device)
+    assert np.abs(done.curve - BEND).max() < 0.004 and np.abs(done.before).max() < 0.003
+
+
+def test_blinks_do_not_count():
+    blinks = [(t, t + 240_000) for t in range(3_000_000, 30_000_000, 3_100_000)]
+    done = linearity.run(BentSensor(BEND, wander=drift, blinks=blinks, frame_us=1999))
+    assert np.abs(done.curve - BEND).max() < 0.004
+
+
+def test_a_step_in_the_light_is_refused_and_nothing_changed():
+    device = BentSensor(BEND, ambient=lambda t_us: 0.5 if t_us < 8_000_000 else 4.0, frame_us=1999)
+    with pytest.raises(CalibrationError, match="not steady: it moved by"):
+        linearity.run(device)
+    unchanged(device)
+
+
+def test_a_light_that_flickers_slowly_is_refused():
+    device = BentSensor(BEND, ambient=lambda t_us: 2.0 + 2.0 * np.sin(t_us * 1e-6 * 9.0), frame_us=1999)
+    with pytest.raises(CalibrationError, match="not steady"):
+        linearity.run(device)
+    unchanged(device)
+
+
+def test_too_weak_a_light_is_refused_and_names_the_sensors():
+    device = BentSensor(BEND, light=0.2, frame_us=1999)
+    with pytest.raises(CalibrationError, match="sensor 5 .*of 1023 codes") as caught:
+        linearity.run(device)
+    assert "white paper" in caught.value.remedy
+    unchanged(device)
+
+
+def test_an_eye_that_never_rests_is_refused():
+    rng = np.random.default_rng(1)
+    places = rng.uniform(-20, 20, (4000, 2))
+    device = BentSensor(BEND, wander=lambda t_us: places[t_us // 60_000 % 4000], frame_us=1999)
+    with pytest.raises(CalibrationError, match="could be compared"):
+        linearity.run(device)
+    unchanged(device)
+
+
+@pytest.mark.parametrize("bit, word", [(lib.SG_FAULT_OPEN, "open"), (lib.SG_FAULT_SHORT, "shorted")])
+def test_a_dead_sensor_is_refused_by_name(bit, word):
+    device = BentSensor(BEND, fault=(0, 0, 0, bit, 0, 0))
+    with pytest.raises(CalibrationError, match=f"sensor 3 is {word}"):
+        linearity.run(device)
+    assert device.stream == []
+
+
+def test_settings_and_held_exposures_are_given_back():
+    device = BentSensor(BEND, frame_us=1999)
+    device.settings(repeats=4)
+    device.exposure(us=[50] * 6)
+    linearity.run(device)
+    assert device.sensing["repeats"] == 4 and not device.automatic and device.exposures == (800,) * 6
+
+
+def test_curves_that_are_no_better_are_not_kept(monkeypatch):
+    device = BentSensor(BEND, frame_us=1999)
+    honest = linearity.fit
+    monkeypatch.setattr(linearity, "fit", lambda holds, curve: honest(holds, curve)._replace(curve=-BEND))
+    done = linearity.run(device)
+    assert not done.kept and device.curves == (0,) * 6
+
+
+def test_the_command_reports_percent_and_octaves(command, command_json, monkeypatch):
+    device = BentSensor(BEND, frame_us=1999)
+    monkeypatch.setattr("sparsegaze.device.Device", lambda port, *_: device)
+    code, data, _ = command_json("linearity", "PORT")
+    assert code == 0 and data["kept"] and not data["calibrate_again"]
+    assert np.abs(np.array(data["shift_percent_after"])).max() < 0.3
+    assert data["shift_percent_before"][2] == pytest.approx(100 * (2 ** data["shift_octaves_before"][2] - 1))
+    code, out, err = command("linearity", "PORT")
+    assert code == 0 and "octaves" in out and "the curves are stored" in out
+    assert "alternating the exposures: 100 %" in err
+
+
+def test_a_model_made_with_other_curves_has_to_be_made_again(command, monkeypatch):
+    from fake_device import linear_model
+
+    device = BentSensor(BEND, frame_us=1999, model=linear_model())
+    monkeypatch.setattr("sparsegaze.device.Device", lambda port, *_: device)
+    assert "run `sparsegaze calibrate PORT` again" in command("linearity", "PORT")[1]
