@@ -16,7 +16,11 @@ DIGITAL = tuple("D%d" % i for i in range(2, 14))  # D0 and D1 are the serial lin
 CHANNELS = ANALOG[:6]
 EMITTERS = {"leds": CHANNELS, "photodiodes": ("D2", "D3", "D4")}
 SUPPLY_PIN = "A7"
-PHASES, SENSE_AT_A_TIME = 3, 2
+# Who senses, and who is lit meanwhile: what the firmware does, phase by phase.
+PHASES = {
+    "leds": (((5, 0), (1, 2, 3, 4)), ((1, 4), (0, 2, 3, 5)), ((2, 3), (0, 1, 4, 5))),
+    "photodiodes": (((0, 3), (0,)), ((1, 4), (1,)), ((2, 5), (2,))),
+}
 # (key, least, most): numbers of [board]
 _NUMBERS = (("rail_volts", 0.0, 5.0), ("rail_ohm", 0.0, 100.0), ("rail_noise_mv", 0.0, 100.0))
 
@@ -52,12 +56,17 @@ def check_wiring(headset, file):
         )
     if "rail_volts" not in board:
         raise SceneError("%s: board: rail_volts is missing" % file, "the rail of the shunt regulator, 2.5")
-    phases = headset.phases
-    if phases and (len(phases) != PHASES or any(len(phase.sense) != SENSE_AT_A_TIME for phase in phases)):
+    phases = tuple((phase.sense, tuple(sorted(phase.light))) for phase in headset.phases)
+    if phases and phases != PHASES[kind]:
         raise SceneError(
-            "%s: the firmware senses in %d phases of %d sensors" % (file, PHASES, SENSE_AT_A_TIME),
-            "write that many [[phase]], or leave all of them out",
+            "%s: these are not the phases of the firmware" % file,
+            "it has %s" % "; ".join(_said(headset, *phase) for phase in PHASES[kind]),
         )
+
+
+def _said(headset, sense, light):
+    sensing = ", ".join(headset.sensors[i].name for i in sense)
+    return "%s by %s" % (sensing, ", ".join(headset.emitters[i].name for i in light))
 
 
 def _check_pins(headset, file):
