@@ -14,7 +14,7 @@ import numpy as np
 from frontend_node import METHODS, RIPPLE_V, TICK_US, node_of, readable, slope, threshold_noise_v, threshold_v
 from frontend_physics import P
 
-EXPOSURES_US = (4, 8, 16, 32, 64, 103, 131, 159, 250, 400, 600)
+EXPOSURES_US = (4, 8, 16, 32, 64, 103, 131, 159, 220, 300, 400, 600)
 CLOCKS_KHZ = (125, 250, 500, 1000)
 LIGHTS = ((200, 0), (75, 0), (600, 0), (200, 2000))  # photocurrent, ambient: nA
 CHOSEN = ("rail", 250, 131)  # and the mean of its two longest exposures at 1 kHz
@@ -98,15 +98,15 @@ def closed_form(method, adc_khz, exposure_us, photocurrent_na, ambient_na):
     if method.reader != "adc":
         return _closed_crossings(method, node, exposure_us, photocurrent_na, ambient_na)
     unlit = 1 if ambient_na else UNLIT_MEAN
-    lit = _charge_noise(method, node, adc_khz, node.collected(total, exposure_us))
-    dark = _charge_noise(method, node, adc_khz, node.collected(ambient_na, exposure_us)) / np.sqrt(unlit)
+    lit = charge_noise(method, node, adc_khz, node.collected(total, exposure_us))
+    dark = charge_noise(method, node, adc_khz, node.collected(ambient_na, exposure_us)) / np.sqrt(unlit)
     noise = np.hypot(lit, 0 if method.name == "cathode_1v1" else dark)
     if method.bias_v == 0:
         return float(noise / slope(node, exposure_us, total) / photocurrent_na)
     return float(noise / (photocurrent_na * exposure_us * 1e-3))
 
 
-def _charge_noise(method, node, adc_khz, charge_pc):
+def charge_noise(method, node, adc_khz, charge_pc):
     """RMS of one read charge, pC."""
     v = node.swing(charge_pc)
     read_v = method.bias_v - v if method.cathode else v
@@ -114,7 +114,7 @@ def _charge_noise(method, node, adc_khz, charge_pc):
     lsb_v = method.full_v / physics.CODES
     reference = RIPPLE_V if method.reference == "supply" else physics.BANDGAP_NOISE_V
     read = np.hypot(physics.adc_noise_lsb(adc_khz) * lsb_v, read_v / method.full_v * reference)
-    parts = [c * read / np.sqrt(method.reads), np.sqrt(physics.ELECTRON_PC * max(charge_pc, 0))]
+    parts = [c * read / np.sqrt(method.reads), np.sqrt(physics.ELECTRON_PC * np.maximum(charge_pc, 0))]
     if method.cathode:
         parts += [(physics.junction_pf(method.bias_v) + P.node.pin_pf) * RIPPLE_V, cs * RIPPLE_V]
     else:
@@ -122,7 +122,7 @@ def _charge_noise(method, node, adc_khz, charge_pc):
             parts.append(physics.junction_pf(reverse_v) * method.bias_noise_v)
     if method.before == "subtracted":
         parts.append(cs * physics.adc_noise_lsb(adc_khz) * lsb_v)
-    return np.sqrt(np.sum(np.square(parts)))
+    return np.sqrt(sum(np.square(part) for part in parts))
 
 
 def _closed_crossings(method, node, exposure_us, photocurrent_na, ambient_na):
