@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Between the source files of the application: what the pipeline (main.c), the requests (app_requests.c), the
-// models (app_models.c) and the live state (app_live.c) share.
+// Between the source files of the application: what the pipeline (main.c), exposure and health (app_sense.c),
+// the timing (app_rate.c), the requests (app_requests.c), the models (app_models.c) and the live state
+// (app_live.c) share.
 #ifndef APP_H
 #define APP_H
 
@@ -9,6 +10,8 @@
 #include "hal.h"
 #include "sg_err.h"
 #include "sg_expose.h"
+#include "sg_health.h"
+#include "sg_light.h"
 #include "sg_link.h"
 #include "sg_model.h"
 #include "sg_track.h"
@@ -25,9 +28,9 @@
 // Everything that is not a model or a live record. One instance, in main.c.
 struct app_state {
     struct sg_link_rx link;
-    struct sg_expose_led led[HAL_CHANNELS];
-    uint16_t exposure_min_cycles;       // the board's limits, inside the core's
-    uint16_t exposure_max_cycles;
+    struct sg_light light;
+    struct sg_expose expose;
+    uint16_t feature[HAL_CHANNELS];     // of the last frame
     uint16_t slot_bytes;
     uint16_t tx_dropped;
     uint16_t rx_rejected;
@@ -35,11 +38,34 @@ struct app_state {
     uint16_t starved;
     uint16_t exposure_changes;
     uint8_t stream;                     // bits of enum sg_stream
-    uint8_t exposure_auto;
+    uint8_t slow_line;                  // 500 kbaud
+    uint8_t probe;                      // the only emitter, or APP_NO_PROBE
+    uint8_t sensed;                     // a cycle has come
+    uint8_t pause;                      // between frames
+    uint8_t infer_fits;                 // beside that of every frame, one for a request
 };
 extern struct app_state app;
+enum { APP_NO_PROBE = 255 };
 
-// A frame's streams; the counts take the place of the features once those are sent.
+// Live state, as it lies in EEPROM. One instance, in app_live.c; who changes it says so by app_live_changed().
+struct app_live {
+    uint32_t model_crc;                 // of the model that `recentre` was made with
+    struct sg_affine recentre;
+    uint16_t exposure_cycles[HAL_CHANNELS];
+    uint16_t boots;
+    uint8_t exposure_auto;
+    uint8_t version;
+    uint16_t limit_cycles[HAL_CHANNELS];    // of automatic exposure
+    uint16_t rate_hz;                   // wanted; 0: as fast as can be
+    int8_t curve_q10[HAL_CHANNELS];
+    uint8_t repeats;
+    uint8_t wiring;
+    uint8_t power;
+    uint8_t lights;
+};
+extern struct app_live app_live;
+
+// A frame's streams; the counts take the place of the raw frame once that is sent.
 struct app_streams {
     union {
         struct sg_raw raw;
@@ -63,6 +89,9 @@ union app_body {
     struct sg_model_data data;
     struct sg_model_verdict verdict;
     struct sg_exposure exposure;
+    struct sg_settings settings;
+    struct sg_curve curve;
+    struct sg_probe probe;
     struct sg_recentre recentre;
     struct app_streams streams;
     uint8_t bytes[SG_WIRE_BODY_MAX];
@@ -71,10 +100,26 @@ extern union app_body app_body;
 
 // main.c
 void app_count(uint16_t *counter);                          // up to 65535
-uint16_t app_exposure_limit(uint16_t exposure_cycles);      // into the board's limits
 uint8_t app_send(uint8_t type, uint16_t seq, const void *body, uint8_t n, uint8_t keep_free);   // 1 if queued
-
 void app_describe(struct sg_hello *hello);
+int8_t app_infer_later(const struct sg_infer *point, uint16_t seq);     // SG_OK: answers by itself when done
+
+// app_sense.c
+void app_sense_start(const struct hal_timing *begin);       // and the port
+void app_sense_timing(const struct hal_timing *wanted);     // from soon on
+const struct hal_timing *app_timing(void);                  // in force
+void app_sense_cycle(const struct hal_cycle *cycle);        // exposure and health of one channel, or two
+uint8_t app_alarm(void);                                    // bits of enum sg_alarm
+uint8_t app_fault(void);                                    // 1: the gaze is not to be trusted
+void app_faults(uint8_t fault[HAL_CHANNELS]);
+void app_expose_by(uint8_t op, const uint16_t exposure_us_q4[HAL_CHANNELS]);    // enum sg_exposure_op
+int8_t app_probe(uint8_t emitter, uint16_t seq);            // SG_OK: begun, answers by itself when done
+uint8_t app_probing(void);                                  // 1: the cycle just added belongs to a probe
+
+// app_rate.c
+void app_rate_start(struct hal_timing *timing);
+void app_rate_renew(void);              // after a change of settings, model, streams or line
+int8_t app_settings(struct sg_settings *io);
 
 // app_models.c
 void app_models_start(void);                                // validate both slots, take the newest
@@ -87,15 +132,18 @@ int8_t app_trial_write(const struct sg_model_data *data);
 int8_t app_trial_use(uint16_t seq);                         // SG_OK: begun, answers by itself when done
 int8_t app_trial_leave(struct sg_model_verdict *verdict);    // and what is in use then
 void app_models_step(void);                                 // one piece of a check under way
+// Its end, which takes as long as an inference or two: 1 if there was one.
+uint8_t app_models_finish(void);
 
 // app_live.c
 void app_live_start(void);                                  // load, count the boot
-uint16_t app_live_boots(void);
-void app_live_exposures(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t *automatic);     // as stored
 const struct sg_affine *app_recentre(void);                 // in force for the model in use; NULL: none
 void app_recentre_set(const struct sg_affine *affine);      // NULL: none
-void app_live_keep_exposures(void);                         // store them as they are now
-void app_live_frame(void);                                  // once per frame: notice exposures that moved
+void app_live_changed(void);
+// Exposures or what makes them were set: stored at once, or those that may be one of many once they rest.
+void app_live_exposed(uint8_t one_of_many);
+void app_live_flush(void);                                  // at once
+void app_live_cycle(uint32_t t_us);                         // notice exposures that moved
 void app_live_step(void);
 
 #endif

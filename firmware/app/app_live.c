@@ -6,115 +6,137 @@
 #include <string.h>
 
 enum {
-    RECORD_VERSION = 2,
-    // Exposures are stored when they moved by more than an eighth, looked at every 256 frames (0.98 s): 31
-    // looks (30 s) after start, then at most every 610 (10 minutes), which 10^5 EEPROM cycles bear for two
-    // years of light that never rests.
-    LOOKS_FIRST = 31,
-    LOOKS_LATER = 610,
-};
-
-struct live_record {
-    uint32_t model_crc;                 // of the model that `recentre` was made with
-    struct sg_affine recentre;
-    uint16_t exposure_cycles[HAL_CHANNELS];
-    uint16_t boots;
-    uint8_t exposure_auto;
-    uint8_t version;
-};
-_Static_assert(sizeof(struct live_record) == 28, "layout in EEPROM");
-_Static_assert(sizeof(struct live_record) <= HAL_RECORD_MAX, "fits the port's store");
-
-// Version 1 had no gains; all else stood in the same order.
-enum {
-    GAINS_AT = offsetof(struct live_record, recentre.gain_q9),
+    RECORD_VERSION = 3,
+    // What the record of firmware that spoke wire 2 held is the beginning of this one, but for the exposures,
+    // which another circuit wanted. That of wire 1 had no gains; all else stood in the same order.
+    V2_BYTES = 28,
+    GAINS_AT = offsetof(struct app_live, recentre.gain_q9),
     AFTER_GAINS = GAINS_AT + sizeof(((struct sg_affine *)0)->gain_q9),
-    V1_BYTES = sizeof(struct live_record) - (AFTER_GAINS - GAINS_AT),
+    V1_BYTES = V2_BYTES - (AFTER_GAINS - GAINS_AT),
+    // Exposures are stored when they moved by more than an eighth, looked at every 1.05 s: 28 looks (30 s)
+    // after start, then at most every 572 (10 minutes), which 10^5 EEPROM cycles bear for two years of light
+    // that never rests.
+    LOOKS_FIRST = 28,
+    LOOKS_LATER = 572,
+    // Those set by command once they have rested for so many looks: a program may try many.
+    LOOKS_REST = 2,
 };
+_Static_assert(sizeof(struct app_live) == 52, "layout in EEPROM");
+_Static_assert(sizeof(struct app_live) <= HAL_RECORD_MAX, "fits the port's store");
+_Static_assert(offsetof(struct app_live, version) == V2_BYTES - 1, "begins like the one of version 2");
 
-static struct live_record live;
+struct app_live app_live;
 static uint8_t dirty;
-static uint8_t frames;
+static uint8_t second;                  // of device time, 1.05 s long
+static uint8_t resting;                 // looks until exposures set by command are stored
 static uint16_t looks = LOOKS_FIRST;
 
-static uint8_t load_v1(void)
+SELDOM static uint8_t load_old(void)
 {
-    uint8_t *byte = (uint8_t *)&live;
-    if (!hal_load(byte, V1_BYTES))
-        return 0;
-    memmove(byte + AFTER_GAINS, byte + GAINS_AT, V1_BYTES - GAINS_AT);
-    memset(byte + GAINS_AT, 0, AFTER_GAINS - GAINS_AT);
-    if (live.version != 1)
-        return 0;
-    live.version = RECORD_VERSION;
+    uint8_t *byte = (uint8_t *)&app_live;
+    if (!hal_load(byte, V2_BYTES) || app_live.version != 2) {
+        if (!hal_load(byte, V1_BYTES))
+            return 0;
+        memmove(byte + AFTER_GAINS, byte + GAINS_AT, V1_BYTES - GAINS_AT);
+        memset(byte + GAINS_AT, 0, AFTER_GAINS - GAINS_AT);
+        if (app_live.version != 1)
+            return 0;
+    }
     return 1;
 }
 
-void app_live_start(void)
+SELDOM void app_live_start(void)
 {
-    if ((!hal_load(&live, sizeof live) || live.version != RECORD_VERSION) && !load_v1()) {
-        live = (struct live_record){ .exposure_auto = 1, .version = RECORD_VERSION };
-        for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-            live.exposure_cycles[i] = SG_EXPOSE_START_CYCLES;
+    if (!hal_load(&app_live, sizeof app_live) || app_live.version != RECORD_VERSION) {
+        if (!load_old())
+            memset(&app_live, 0, sizeof app_live);
+        memset((uint8_t *)&app_live + V2_BYTES, 0, sizeof app_live - V2_BYTES);
+        for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+            app_live.exposure_cycles[i] = SG_EXPOSE_START_CYCLES;
+            app_live.limit_cycles[i] = UINT16_MAX;
+        }
+        app_live.exposure_auto = 1;
+        app_live.repeats = 1;
+        app_live.lights = 1;
+        app_live.version = RECORD_VERSION;
     }
-    live.boots++;
+    app_live.boots++;
     dirty = 1;
-}
-
-uint16_t app_live_boots(void)
-{
-    return live.boots;
-}
-
-void app_live_exposures(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t *automatic)
-{
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        exposure_cycles[i] = live.exposure_cycles[i];
-    *automatic = live.exposure_auto != 0;
 }
 
 const struct sg_affine *app_recentre(void)
 {
     const struct sg_model_view *model = app_model();
-    return model && model->crc == live.model_crc ? &live.recentre : NULL;
+    return model && model->crc == app_live.model_crc ? &app_live.recentre : NULL;
 }
 
-void app_recentre_set(const struct sg_affine *affine)
+SELDOM void app_recentre_set(const struct sg_affine *affine)
 {
     const struct sg_model_view *model = app_model();
-    live.model_crc = model ? model->crc : 0;
-    memset(&live.recentre, 0, sizeof live.recentre);
+    app_live.model_crc = model ? model->crc : 0;
+    memset(&app_live.recentre, 0, sizeof app_live.recentre);
     if (affine)
-        live.recentre = *affine;
+        app_live.recentre = *affine;
     dirty = 1;
 }
 
-void app_live_keep_exposures(void)
+void app_live_changed(void)
+{
+    dirty = 1;
+}
+
+SELDOM static void keep_exposures(void)
 {
     for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        live.exposure_cycles[i] = app.led[i].exposure_cycles;
-    live.exposure_auto = app.exposure_auto;
+        app_live.exposure_cycles[i] = app.expose.led[i].exposure_cycles;
     dirty = 1;
 }
 
-void app_live_frame(void)
+void app_live_exposed(uint8_t one_of_many)
 {
-    if (++frames != 0 || --looks != 0)
+    if (one_of_many)
+        resting = LOOKS_REST;
+    else
+        keep_exposures();
+}
+
+SELDOM void app_live_flush(void)
+{
+    if (resting)
+        keep_exposures();
+    resting = 0;
+}
+
+// Once in 1.05 s.
+SELDOM static void look(void)
+{
+    if (resting && --resting == 0)
+        keep_exposures();
+    if (--looks != 0)
         return;
     looks = 1;
     for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-        const uint16_t now = app.led[i].exposure_cycles, stored = live.exposure_cycles[i];
+        const uint16_t now = app.expose.led[i].exposure_cycles, stored = app_live.exposure_cycles[i];
         const uint16_t moved = now > stored ? now - stored : stored - now;
         if (moved > stored >> 3) {
-            app_live_keep_exposures();
+            keep_exposures();
             looks = LOOKS_LATER;
             return;
         }
     }
 }
 
+void app_live_cycle(uint32_t t_us)
+{
+    const uint8_t now = (uint8_t)((uint16_t)(t_us >> 16) >> 4);
+    if (now != second) {
+        second = now;
+        look();
+    }
+}
+
 void app_live_step(void)
 {
-    if (dirty && hal_save(&live, sizeof live))
+    if (dirty && hal_save(&app_live, sizeof app_live))
         dirty = 0;
 }

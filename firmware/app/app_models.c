@@ -8,7 +8,8 @@
 
 #include "sg_rom.h"
 
-enum { SLOTS = 3, PIECE_BYTES = 64, CRC_FROM = 8 };
+// A piece of a check: of the pages so many bytes, else a node or a record. It may make a frame wait.
+enum { SLOTS = 3, PIECE_BYTES = 8, CRC_FROM = 8 };
 
 // A check under way, of slot `slot`, asked for by request `seq`.
 struct check {
@@ -18,6 +19,7 @@ struct check {
     uint16_t seq;
     uint8_t type;               // of the request
     uint8_t slot;
+    int8_t parts;               // what has been found so far
 };
 
 static struct sg_model_view view[SLOTS];        // length 0: not a model
@@ -42,13 +44,22 @@ static uint8_t slot_space(uint8_t slot)
     return slot == SG_SLOT_RAM ? (uint8_t)SG_ROM_MEMORY : (uint8_t)HAL_SLOT_SPACE;
 }
 
-static void forget(uint8_t slot, int8_t why)
+SELDOM static void forget(uint8_t slot, int8_t why)
 {
     memset(&view[slot], 0, sizeof view[slot]);
     verdict[slot] = why;
 }
 
-void app_models_start(void)
+// Another model takes another time.
+SELDOM static void use(uint8_t slot)
+{
+    if (active == slot)
+        return;
+    active = slot;
+    app_rate_renew();
+}
+
+SELDOM void app_models_start(void)
 {
     for (uint8_t slot = SG_SLOT_A; slot <= SG_SLOT_B; slot++) {
         const uint8_t *image = hal_slot(slot);
@@ -74,7 +85,7 @@ uint8_t app_model_slot(void)
     return active;
 }
 
-void app_model_info(struct sg_model_info *info)
+SELDOM void app_model_info(struct sg_model_info *info)
 {
     memset(info, 0, sizeof *info);
     for (uint8_t slot = 0; slot < SLOTS; slot++) {
@@ -87,7 +98,7 @@ void app_model_info(struct sg_model_info *info)
     info->active = active;
 }
 
-int8_t app_model_read(const struct sg_model_at *at, struct sg_model_data *data)
+SELDOM int8_t app_model_read(const struct sg_model_at *at, struct sg_model_data *data)
 {
     if (at->slot >= SLOTS || at->length < 1 || at->length > SG_WIRE_DATA_MAX)
         return SG_E_ARG;
@@ -103,7 +114,7 @@ int8_t app_model_read(const struct sg_model_at *at, struct sg_model_data *data)
     return SG_OK;
 }
 
-static void answer(int8_t result)
+SELDOM static void answer(int8_t result)
 {
     struct sg_model_verdict body = { .crc = check.crc, .verdict = result, .slot = check.slot };
     // Not queued only while the line is full of answers: ask again in the next turn.
@@ -111,11 +122,11 @@ static void answer(int8_t result)
         return;
     check.at = 0;
     if (check.type == SG_MSG_TRIAL_USE && result == SG_OK)
-        active = SG_SLOT_RAM;
+        use(SG_SLOT_RAM);
 }
 
 // The header alone decides how far to read; one that is wrong is answered for at once, with CRC 0.
-static int8_t begin(uint8_t type, uint8_t slot, uint16_t seq)
+SELDOM static int8_t begin(uint8_t type, uint8_t slot, uint16_t seq)
 {
     const uint8_t *image = slot_image(slot);
     if (!image)
@@ -128,23 +139,23 @@ static int8_t begin(uint8_t type, uint8_t slot, uint16_t seq)
     return SG_OK;
 }
 
-int8_t app_model_verify(uint8_t slot, uint16_t seq)
+SELDOM int8_t app_model_verify(uint8_t slot, uint16_t seq)
 {
     if (slot >= SLOTS)
         return SG_E_ARG;
     return begin(SG_MSG_MODEL_VERIFY, slot, seq);
 }
 
-int8_t app_trial_use(uint16_t seq)
+SELDOM int8_t app_trial_use(uint16_t seq)
 {
     return begin(SG_MSG_TRIAL_USE, SG_SLOT_RAM, seq);
 }
 
-int8_t app_trial_leave(struct sg_model_verdict *body)
+SELDOM int8_t app_trial_leave(struct sg_model_verdict *body)
 {
     if (check.at && check.type == SG_MSG_TRIAL_USE)
         return SG_E_BUSY;
-    active = stored;
+    use(stored);
     memset(body, 0, sizeof *body);
     body->slot = active;
     body->crc = active == SG_SLOT_NONE ? 0 : view[active].crc;
@@ -152,7 +163,7 @@ int8_t app_trial_leave(struct sg_model_verdict *body)
     return SG_OK;
 }
 
-int8_t app_trial_write(const struct sg_model_data *data)
+SELDOM int8_t app_trial_write(const struct sg_model_data *data)
 {
     if (data->slot != SG_SLOT_RAM || data->length < 1 || data->length > SG_WIRE_DATA_MAX)
         return SG_E_ARG;
@@ -161,37 +172,40 @@ int8_t app_trial_write(const struct sg_model_data *data)
     if (check.at && check.slot == SG_SLOT_RAM)
         return SG_E_BUSY;
     if (active == SG_SLOT_RAM)
-        active = stored;        // a model in use never changes
+        use(stored);            // a model in use never changes
     memcpy(trial + data->offset, data->data, data->length);
     forget(SG_SLOT_RAM, SG_E_STATE);            // not checked since
     return SG_OK;
 }
 
-SELDOM static void check_on(void)
+SELDOM uint8_t app_models_finish(void)
 {
-    const uint8_t *image = slot_image(check.slot);
-    const uint8_t space = slot_space(check.slot);
-    if (check.at < check.length) {
-        const uint16_t left = check.length - check.at;
-        const uint16_t n = left < PIECE_BYTES ? left : (uint16_t)PIECE_BYTES;
-        check.crc = sg_model_crc32_at(check.crc, image + check.at, n, space);
-        check.at += n;
-        return;
-    }
+    if (!check.at || check.at < check.length)
+        return 0;
     struct sg_model_view found;
     memset(&found, 0, sizeof found);
-    const uint16_t room = slot_room(check.slot);
-    const int8_t result = (int8_t)sg_model_open_checked(&found, image, room, space, check.crc);
+    const int8_t result = (int8_t)sg_model_open_checked(&found, slot_image(check.slot), slot_room(check.slot),
+                                                        slot_space(check.slot), check.crc, check.parts);
     // Flash cannot have changed since boot; what a verification finds there is only told.
     if (check.slot == SG_SLOT_RAM && active != SG_SLOT_RAM) {
         view[SG_SLOT_RAM] = found;
         verdict[SG_SLOT_RAM] = result;
     }
     answer(result);
+    return 1;
 }
 
 void app_models_step(void)
 {
-    if (check.at)
-        check_on();
+    if (!check.at || check.at >= check.length)
+        return;
+    const uint8_t *image = slot_image(check.slot);
+    const uint8_t space = slot_space(check.slot);
+    uint16_t next = sg_model_part(image, check.at, space);
+    if (check.at < SG_MODEL_HEAD_BYTES)
+        next = check.at + PIECE_BYTES;
+    else if (check.parts == SG_OK)
+        check.parts = (int8_t)sg_model_check_part(image, check.at, space);
+    check.crc = sg_model_crc32_at(check.crc, image + check.at, next - check.at, space);
+    check.at = next;
 }

@@ -10,7 +10,7 @@ enum { REBOOT_KEY = 0xA5, STREAM_ALL = SG_STREAM_RAW | SG_STREAM_GAZE | SG_STREA
 
 union app_body app_body;
 
-static void refuse(uint8_t type, uint16_t seq, int8_t error)
+SELDOM static void refuse(uint8_t type, uint16_t seq, int8_t error)
 {
     const struct sg_error why = { .error = error, .type = type };
     app_count(&app.rx_rejected);
@@ -18,7 +18,7 @@ static void refuse(uint8_t type, uint16_t seq, int8_t error)
 }
 
 // Shortest body of a request, bytes; -1: there is no such request.
-static int8_t shortest(uint8_t type)
+SELDOM static int8_t shortest(uint8_t type)
 {
     switch (type) {
     case SG_MSG_HELLO:
@@ -31,9 +31,14 @@ static int8_t shortest(uint8_t type)
     case SG_MSG_TRIAL_USE:
     case SG_MSG_REBOOT:
     case SG_MSG_BAUD:
+    case SG_MSG_PROBE:
         return sizeof(struct sg_mode);
     case SG_MSG_INFER:
         return sizeof(struct sg_infer);
+    case SG_MSG_SETTINGS:
+        return sizeof(struct sg_settings);
+    case SG_MSG_CURVE:
+        return sizeof(struct sg_curve);
     case SG_MSG_MODEL_READ:
     case SG_MSG_MODEL_VERIFY:
         return sizeof(struct sg_model_at);
@@ -48,13 +53,14 @@ static int8_t shortest(uint8_t type)
     }
 }
 
-static void status(struct sg_status *out)
+SELDOM static void status(struct sg_status *out)
 {
     memset(out, 0, sizeof *out);
+    hal_report(out);
     out->t_us = hal_now_us();
     for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        out->exposure_us_q2[i] = sg_expose_to_us_q2(app.led[i].exposure_cycles);
-    out->boot_count = app_live_boots();
+        out->exposure_us_q4[i] = app.expose.led[i].exposure_cycles;
+    out->boot_count = app_live.boots;
     out->tx_dropped = app.tx_dropped;
     const uint16_t bad = app.link.bad_crc + app.link.bad_length;
     out->rx_bad = bad < app.link.bad_crc ? UINT16_MAX : bad;
@@ -63,46 +69,39 @@ static void status(struct sg_status *out)
     out->starved = app.starved;
     out->exposure_changes = app.exposure_changes;
     out->stream = app.stream;
-    out->exposure_auto = app.exposure_auto;
+    out->exposure_auto = app_live.exposure_auto;
     out->active = app_model_slot();
-    hal_report(out);
+    app_faults(out->fault);
+    out->alarm |= app_alarm();
 }
 
-static int8_t exposure(struct sg_exposure *io)
+SELDOM static int8_t exposure(struct sg_exposure *io)
 {
-    uint16_t cycles[HAL_CHANNELS];
-    switch (io->op) {
-    case SG_EXPOSURE_GET:
-        break;
-    case SG_EXPOSURE_SET:
-        for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-            cycles[i] = app_exposure_limit(sg_expose_from_us_q2(io->exposure_us_q2[i]));
-            sg_expose_start(&app.led[i], cycles[i]);
-        }
-        hal_expose(cycles);
-        app.exposure_auto = 0;
-        break;
-    case SG_EXPOSURE_AUTO:
-        for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-            sg_expose_start(&app.led[i], app.led[i].exposure_cycles);
-        app.exposure_auto = 1;
-        break;
-    case SG_EXPOSURE_HOLD:
-        app.exposure_auto = 0;
-        break;
-    default:
+    if (io->op > SG_EXPOSURE_LIMIT)
         return SG_E_ARG;
-    }
-    if (io->op != SG_EXPOSURE_GET)
-        app_live_keep_exposures();
+    app_expose_by(io->op, io->exposure_us_q4);
     for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        io->exposure_us_q2[i] = sg_expose_to_us_q2(app.led[i].exposure_cycles);
-    io->op = app.exposure_auto ? SG_EXPOSURE_AUTO : SG_EXPOSURE_HOLD;
+        io->exposure_us_q4[i] = app.expose.led[i].exposure_cycles;
+    io->op = app_live.exposure_auto ? SG_EXPOSURE_AUTO : SG_EXPOSURE_HOLD;
     io->reserved = 0;
     return SG_OK;
 }
 
-static int8_t recentre(struct sg_recentre *io)
+SELDOM static int8_t curve(struct sg_curve *io)
+{
+    if (io->op > SG_SETTINGS_SET)
+        return SG_E_ARG;
+    if (io->op == SG_SETTINGS_SET) {
+        memcpy(app_live.curve_q10, io->curve_q10, sizeof app_live.curve_q10);
+        app_live_changed();
+        sg_light_curve(&app.light, app_live.curve_q10);
+    }
+    memcpy(io->curve_q10, app_live.curve_q10, sizeof io->curve_q10);
+    io->reserved = 0;
+    return SG_OK;
+}
+
+SELDOM static int8_t recentre(struct sg_recentre *io)
 {
     if (io->op > SG_RECENTRE_CLEAR)
         return SG_E_ARG;
@@ -120,18 +119,7 @@ static int8_t recentre(struct sg_recentre *io)
     return SG_OK;
 }
 
-static void infer(uint16_t seq)
-{
-    const uint8_t flags = app_model_slot() == SG_SLOT_RAM ? SG_FLAG_TRIAL : 0;
-    const struct sg_model_view *model = app_model();
-    const struct sg_affine *recentre = app_recentre();
-    HAL_BEGIN(HAL_SECTION_REQUEST);
-    sg_track_infer(model, app_body.infer.feature, flags, recentre, &app_body.gaze);
-    HAL_END(HAL_SECTION_REQUEST);
-    app_send(SG_MSG_INFER | SG_REPLY, seq, &app_body.gaze, sizeof app_body.gaze, 0);
-}
-
-static int8_t trial_write(uint8_t n)
+SELDOM static int8_t trial_write(uint8_t n)
 {
     if (app_body.data.length > n - offsetof(struct sg_model_data, data))
         return SG_E_SHORT;
@@ -148,7 +136,7 @@ SELDOM static void request(const struct sg_head *head, uint8_t n, uint32_t arriv
 {
     uint8_t answer_bytes = 0;
     int8_t result = SG_OK;
-    uint8_t answered = 0;               // later, by app_models_step()
+    uint8_t answered = 0;               // later, by who does it
     const int8_t least = shortest(head->type);
 
     if (least < 0 || n < (uint8_t)least) {
@@ -172,9 +160,15 @@ SELDOM static void request(const struct sg_head *head, uint8_t n, uint32_t arriv
     case SG_MSG_MODE:
         if (app_body.mode.mode & ~STREAM_ALL)
             result = SG_E_ARG;
-        else
+        else if (app.stream != app_body.mode.mode) {
             app.stream = app_body.mode.mode;
+            app_rate_renew();
+        }
         answer_bytes = sizeof app_body.mode;
+        break;
+    case SG_MSG_INFER:
+        result = app_infer_later(&app_body.infer, head->seq);
+        answered = 1;
         break;
     case SG_MSG_MODEL_INFO:
         app_model_info(&app_body.info);
@@ -209,6 +203,18 @@ SELDOM static void request(const struct sg_head *head, uint8_t n, uint32_t arriv
         result = exposure(&app_body.exposure);
         answer_bytes = sizeof app_body.exposure;
         break;
+    case SG_MSG_SETTINGS:
+        result = app_settings(&app_body.settings);
+        answer_bytes = sizeof app_body.settings;
+        break;
+    case SG_MSG_CURVE:
+        result = curve(&app_body.curve);
+        answer_bytes = sizeof app_body.curve;
+        break;
+    case SG_MSG_PROBE:
+        result = app_probe(app_body.mode.mode, head->seq);
+        answered = 1;
+        break;
     case SG_MSG_RECENTRE:
         result = recentre(&app_body.recentre);
         answer_bytes = sizeof app_body.recentre;
@@ -230,19 +236,21 @@ SELDOM static void request(const struct sg_head *head, uint8_t n, uint32_t arriv
     if (answered)
         return;
     app_send(head->type | SG_REPLY, head->seq, app_body.bytes, answer_bytes, 0);
-    if (head->type == SG_MSG_REBOOT)
+    if (head->type == SG_MSG_REBOOT) {
+        app_live_flush();
         hal_after_sending(HAL_AFTER_REBOOT);
-    if (head->type == SG_MSG_BAUD)
-        hal_after_sending(app_body.mode.mode ? HAL_AFTER_BAUD_500K : HAL_AFTER_BAUD_1M);
+    }
+    if (head->type == SG_MSG_BAUD) {
+        app.slow_line = app_body.mode.mode;
+        app_rate_renew();
+        hal_after_sending(app.slow_line ? HAL_AFTER_BAUD_500K : HAL_AFTER_BAUD_1M);
+    }
 }
 
 void app_on_byte(uint8_t byte, uint32_t zero_us)
 {
     struct sg_head head;
     const int n = sg_link_receive(&app.link, byte, &head, app_body.bytes);
-    // Inference goes deepest: not from inside of request().
-    if (n >= (int)sizeof app_body.infer && head.type == SG_MSG_INFER)
-        infer(head.seq);
-    else if (n >= 0)
+    if (n >= 0)
         request(&head, (uint8_t)n, zero_us);
 }

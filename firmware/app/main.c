@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The application: one frame's way from ADC codes to bytes on the line. It knows the core and hal.h and
-// nothing of the chip.
+// The application: a frame's way from the readings of its cycles to bytes on the line. It knows the core and
+// hal.h and nothing of the chip.
 #include "app.h"
 
 #include <string.h>
@@ -9,26 +9,34 @@ enum {
     // Stream frames leave this much of the send queue to answers.
     REPLY_RESERVE = SG_WIRE_FRAME_MAX,
     // A blink leaves the calibrated range before the lids are where they were: this long after the last frame
-    // out of range a gaze may look right and be wrong. 31 ms at 3.84 ms.
-    RECOVERY_FRAMES = 8,
+    // out of range a gaze may look right and be wrong.
+    RECOVERY_US = 31000,
 };
 
 struct app_state app;
 
+// A request for an inference, until there is time for it.
+static struct {
+    struct sg_infer point;
+    uint16_t seq;
+    uint8_t waiting;
+} asked;
+
+// The frame under way.
+static uint32_t first_us;               // mean sample time of its first cycle
+static uint32_t later_us;               // sum of what the others' is later
+static uint8_t taken;                   // cycles
+static uint8_t left;                    // of the last one taken
+static uint16_t frame_seq;
+
 static uint16_t previous_exposure[HAL_CHANNELS];
-static uint8_t recovery;                // frames left that are RECOVERING
+static uint32_t out_us;                 // when the last frame out of range was sensed
+static uint8_t recovering;
 
 void app_count(uint16_t *counter)
 {
     if (*counter != UINT16_MAX)
         ++*counter;
-}
-
-uint16_t app_exposure_limit(uint16_t exposure_cycles)
-{
-    if (exposure_cycles < app.exposure_min_cycles)
-        return app.exposure_min_cycles;
-    return exposure_cycles > app.exposure_max_cycles ? app.exposure_max_cycles : exposure_cycles;
 }
 
 uint8_t app_send(uint8_t type, uint16_t seq, const void *body, uint8_t n, uint8_t keep_free)
@@ -37,114 +45,180 @@ uint8_t app_send(uint8_t type, uint16_t seq, const void *body, uint8_t n, uint8_
     return hal_send(&head, body, n, keep_free);
 }
 
-static void send_stream(uint8_t type, uint16_t seq, const void *body, uint8_t n)
+static void send_stream(uint8_t type, const void *body, uint8_t n)
 {
-    if (!app_send(type, seq, body, n, REPLY_RESERVE))
+    if (!app_send(type, frame_seq, body, n, REPLY_RESERVE))
         app_count(&app.tx_dropped);
 }
 
-// Compared with the frame before, as sensed: a change takes effect in the middle of a frame or one later.
-static uint8_t exposures_changed(const struct hal_frame *frame)
+SELDOM int8_t app_infer_later(const struct sg_infer *point, uint16_t seq)
 {
-    uint8_t changed = 0;
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-        changed |= frame->exposure_cycles[i] != previous_exposure[i];
-        previous_exposure[i] = frame->exposure_cycles[i];
-    }
-    return changed ? SG_FLAG_EXPOSURE : 0;
+    if (asked.waiting)
+        return SG_E_BUSY;
+    asked.point = *point;
+    asked.seq = seq;
+    asked.waiting = 1;
+    return SG_OK;
 }
 
-SELDOM static void expose_next(const struct hal_frame *frame)
+// What takes as long as an inference and is done in the place of one, or when there is time for both: 1 if there
+// was something.
+NOT_KEPT static uint8_t long_work(void)
 {
-    uint16_t exposure[HAL_CHANNELS];
+    if (!asked.waiting)
+        return app_models_finish();
+    HAL_BEGIN(HAL_SECTION_REQUEST);
+    sg_track_infer(app_model(), asked.point.feature, 0, app_recentre(), &app_body.gaze);
+    HAL_END(HAL_SECTION_REQUEST);
+    // Not queued only while the line is full of answers: again in the next turn.
+    if (app_send(SG_MSG_INFER | SG_REPLY, asked.seq, &app_body.gaze, sizeof app_body.gaze, 0))
+        asked.waiting = 0;
+    return 1;
+}
+
+// Compared with the frame before, as sensed.
+static uint8_t exposures_changed(const struct sg_reading *reading)
+{
     uint8_t changed = 0;
     for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-        struct sg_expose_led *led = &app.led[i];
-        const uint16_t before = led->exposure_cycles;
-        sg_expose_step(led, frame->code_q2[i], frame->exposure_cycles[i]);
-        led->exposure_cycles = app_exposure_limit(led->exposure_cycles);
-        exposure[i] = led->exposure_cycles;
-        if (before != exposure[i]) {
-            changed = 1;
-            app_count(&app.exposure_changes);
+        if (reading->exposure_cycles[i] != previous_exposure[i]) {
+            previous_exposure[i] = reading->exposure_cycles[i];
+            changed = SG_FLAG_EXPOSURE;
         }
     }
-    if (changed)
-        hal_expose(exposure);
+    return changed;
 }
 
-static void count_readings(const struct hal_frame *frame)
+NOT_KEPT static void send_raw(struct sg_raw *raw, const struct sg_model_view *model, const struct sg_affine *recentre)
+{
+    raw->model_crc = model ? model->crc : 0;
+    memcpy(raw->feature, app.feature, sizeof raw->feature);
+    raw->reserved = 0;
+    memset(&raw->recentre, 0, sizeof raw->recentre);
+    if (recentre)
+        raw->recentre = *recentre;
+    send_stream(SG_MSG_RAW, raw, sizeof *raw);
+}
+
+NOT_KEPT static void send_counts(struct sg_counts *counts, const struct sg_reading *reading, uint32_t t_us)
+{
+    counts->t_us = t_us;
+    memcpy(counts->lit_code, reading->lit_code, sizeof counts->lit_code);
+    memcpy(counts->unlit_code, reading->unlit_code, sizeof counts->unlit_code);
+    // 1/16 us is a cycle.
+    memcpy(counts->exposure_us_q4, reading->exposure_cycles, sizeof counts->exposure_us_q4);
+    send_stream(SG_MSG_COUNTS, counts, sizeof *counts);
+}
+
+SELDOM static void count_readings(void)
 {
     for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-        if (frame->code_q2[i] <= SG_EXPOSE_SATURATED_Q2)
+        if (app.light.channel[i].flags & SG_LIGHT_SATURATED)
             app_count(&app.saturated);
-        if (frame->code_q2[i] > 4096 - SG_EXPOSE_STARVED_Q2)
+        if (app.light.channel[i].flags & SG_LIGHT_STARVED)
             app_count(&app.starved);
     }
 }
 
-static void stream(const struct hal_frame *frame, struct app_streams *out)
-{
-    // The gaze goes first: it is the one that somebody waits for.
-    if (app.stream & SG_STREAM_GAZE)
-        send_stream(SG_MSG_GAZE, frame->seq, &out->gaze, sizeof out->gaze);
-    if (app.stream & SG_STREAM_RAW)
-        send_stream(SG_MSG_RAW, frame->seq, &out->raw, sizeof out->raw);
-    if (app.stream & SG_STREAM_COUNTS) {
-        out->counts.t_us = frame->t_us;
-        for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-            out->counts.count_q2[i] = frame->code_q2[i];
-            out->counts.exposure_us_q2[i] = sg_expose_to_us_q2(frame->exposure_cycles[i]);
-        }
-        send_stream(SG_MSG_COUNTS, frame->seq, &out->counts, sizeof out->counts);
-    }
-}
-
-void app_on_frame(const struct hal_frame *frame)
+// The frame whose last cycle this is: features -> gaze -> streams, the gaze first, somebody waits for it.
+static void finish_frame(const struct hal_cycle *cycle, uint32_t t_us)
 {
     const struct sg_model_view *model = app_model();
     const struct sg_affine *recentre = app_recentre();
     struct app_streams *out = &app_body.streams;
 
     HAL_BEGIN(HAL_SECTION_FEATURE);
-    uint8_t flags = sg_track_features(frame->code_q2, frame->exposure_cycles, out->raw.feature);
+    uint8_t flags = sg_light_features(&app.light, app.feature);
     HAL_END(HAL_SECTION_FEATURE);
-    flags |= exposures_changed(frame);
-    if (app_model_slot() == SG_SLOT_RAM)
-        flags |= SG_FLAG_TRIAL;
-    if (recovery) {
-        flags |= SG_FLAG_RECOVERING;
-        recovery--;
+    if (flags)
+        count_readings();
+    flags |= exposures_changed(&cycle->reading);
+    if (app_fault())
+        flags |= SG_FLAG_FAULT;
+    if (recovering) {
+        if (t_us - out_us > RECOVERY_US)
+            recovering = 0;
+        else
+            flags |= SG_FLAG_RECOVERING;
     }
-    out->raw.flags = flags;
-    out->raw.model_crc = model ? model->crc : 0;
-    out->raw.t_us = frame->t_us;
-    out->raw.span_us = frame->span_us;
-    out->raw.reserved = 0;
-    memset(&out->raw.recentre, 0, sizeof out->raw.recentre);
-    if (recentre)
-        out->raw.recentre = *recentre;
 
     HAL_BEGIN(HAL_SECTION_INFER);
-    sg_track_infer(model, out->raw.feature, flags, recentre, &out->gaze);
+    sg_track_infer(model, app.feature, flags, recentre, &out->gaze);
     HAL_END(HAL_SECTION_INFER);
-    if (out->gaze.flags & SG_FLAG_OUT_OF_RANGE)
-        recovery = RECOVERY_FRAMES;
-    out->gaze.t_us = frame->t_us;
-    out->gaze.infer_us = (uint16_t)(hal_now_us() - (frame->t_us + frame->span_us));
+    if (out->gaze.flags & SG_FLAG_OUT_OF_RANGE) {
+        out_us = t_us;
+        recovering = 1;
+    }
 
     HAL_BEGIN(HAL_SECTION_OUTPUT);
-    stream(frame, out);
+    if (app.stream & SG_STREAM_GAZE) {
+        out->gaze.t_us = t_us;
+        out->gaze.infer_us = (uint16_t)(hal_now_us() - cycle->t_us) - cycle->span_us;
+        send_stream(SG_MSG_GAZE, &out->gaze, sizeof out->gaze);
+    }
+    if (app.stream & SG_STREAM_RAW) {
+        out->raw.t_us = t_us;
+        out->raw.span_us = (uint16_t)(cycle->t_us - t_us) + cycle->span_us;
+        out->raw.flags = flags;
+        send_raw(&out->raw, model, recentre);
+    }
+    if (app.stream & SG_STREAM_COUNTS)
+        send_counts(&out->counts, &cycle->reading, t_us);
     HAL_END(HAL_SECTION_OUTPUT);
-
-    if (flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED))
-        count_readings(frame);
-    if (app.exposure_auto)
-        expose_next(frame);
-    app_live_frame();
 }
 
-void app_describe(struct sg_hello *hello)
+static uint32_t mean_time(const struct hal_cycle *cycle)
+{
+    if (taken == 1)
+        return cycle->t_us;
+    // A frame whose every cycle came has a power of two of them; one with a gap is late anyway.
+    uint8_t shift = 0;
+    while (taken >> 1 >> shift)
+        shift++;
+    return first_us + (later_us >> shift);
+}
+
+// Take up a cycle: is it the next of the frame under way?
+static void take(const struct hal_cycle *cycle)
+{
+    if (taken == 0 || cycle->seq != frame_seq || cycle->left != left - 1) {
+        if (cycle->left != app_live.repeats - 1 || cycle->seq != (uint16_t)(frame_seq + 1U) || app.pause)
+            sg_light_gap(&app.light);
+        if (taken)                      // cycles of a frame that lost its last one
+            sg_light_features(&app.light, app.feature);
+        frame_seq = cycle->seq;
+        taken = 0;
+        later_us = 0;
+        first_us = cycle->t_us;
+    }
+    taken++;
+    left = cycle->left;
+    if (taken != 1)
+        later_us += cycle->t_us - first_us;
+    sg_light_add(&app.light, &cycle->reading);
+}
+
+void app_on_cycle(const struct hal_cycle *cycle)
+{
+    app.sensed = 1;
+    take(cycle);
+    const uint8_t last = cycle->left == 0;
+    if (app_probing()) {
+        if (last && app.stream)
+            app_count(&app.tx_dropped);
+    } else {
+        if (last && !long_work())
+            finish_frame(cycle, mean_time(cycle));
+        else if (last && app.stream)
+            app_count(&app.tx_dropped);
+        app_sense_cycle(cycle);
+    }
+    if (last)
+        taken = 0;
+    app_live_cycle(cycle->t_us);
+}
+
+SELDOM void app_describe(struct sg_hello *hello)
 {
     hal_describe(hello);
     hello->firmware = APP_FIRMWARE_VERSION;
@@ -156,28 +230,25 @@ void app_describe(struct sg_hello *hello)
 
 SELDOM static void start(void)
 {
-    uint16_t exposure[HAL_CHANNELS];
     struct sg_hello hello;
+    struct hal_timing timing;
 
     hal_boot();
     app_describe(&hello);
-    app.exposure_min_cycles = hello.exposure_min_us * (uint16_t)SG_EXPOSE_CYCLES_PER_US;
-    app.exposure_max_cycles = hello.exposure_max_us * (uint16_t)SG_EXPOSE_CYCLES_PER_US;
     app.slot_bytes = (uint16_t)hello.slot_bytes;
+    app.probe = APP_NO_PROBE;
     app_models_start();
     app_live_start();
-    app_live_exposures(exposure, &app.exposure_auto);
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-        sg_expose_start(&app.led[i], app_exposure_limit(exposure[i]));
-        exposure[i] = app.led[i].exposure_cycles;
-    }
-    hal_start(exposure);
+    app_rate_start(&timing);
+    app_sense_start(&timing);
 }
 
 int main(void)
 {
     start();
     while (hal_poll()) {
+        if (!app.sensed || app.infer_fits)
+            long_work();
         app_models_step();
         app_live_step();
     }

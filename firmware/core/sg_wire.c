@@ -3,65 +3,70 @@
 
 #include "sg_err.h"
 
-static uint16_t crc16_byte(uint16_t crc, uint8_t byte)
+// CRC-16, its bytes apart because that is how an AVR shifts.
+struct crc { uint8_t high, low; };
+
+// x^16 + x^12 + x^5 + 1 divides a byte at once: its quotient is the byte xor its own high nibble.
+static inline void crc16_byte(struct crc *crc, uint8_t byte)
 {
-    // x^16 + x^12 + x^5 + 1 divides a byte at once: its quotient is the byte xor its own high nibble.
-    uint8_t t = (uint8_t)((crc >> 8) ^ byte);
-    t = (uint8_t)(t ^ (t >> 4));
-    crc = (uint16_t)(crc << 8);
-    return (uint16_t)(crc ^ (uint16_t)((uint16_t)t << 12) ^ (uint16_t)((uint16_t)t << 5) ^ t);
+    uint8_t q = (uint8_t)(crc->high ^ byte);
+    q = (uint8_t)(q ^ (q >> 4));
+    crc->high = (uint8_t)(crc->low ^ (uint8_t)(q << 4) ^ (q >> 3));
+    crc->low = (uint8_t)(q ^ (uint8_t)(q << 5));
 }
 
 uint16_t sg_wire_crc16(uint16_t crc, const uint8_t *data, size_t n)
 {
+    struct crc now = { .high = (uint8_t)(crc >> 8), .low = (uint8_t)crc };
     for (size_t i = 0; i < n; i++)
-        crc = crc16_byte(crc, data[i]);
-    return crc;
+        crc16_byte(&now, data[i]);
+    return (uint16_t)(((uint16_t)now.high << 8) | now.low);
 }
 
 uint16_t sg_wire_encode_ring(const struct sg_head *head, const void *body, uint8_t body_bytes, uint8_t *ring,
                              uint16_t size, uint16_t at)
 {
     // A packet has at most 70 bytes, so no group reaches the 254 bytes at which COBS needs a second rule.
-    const uint8_t head_byte[SG_WIRE_HEAD_BYTES] = {
+    uint8_t edge[SG_WIRE_HEAD_BYTES] = {    // head, and in the end the CRC
         (uint8_t)head->seq, (uint8_t)(head->seq >> 8), head->type, head->flags,
     };
-    const uint8_t *from = head_byte;
+    const uint8_t *from = edge;
     uint8_t left = SG_WIRE_HEAD_BYTES, part = 0;    // head, body, CRC
-    uint8_t tail[2];
-    uint16_t crc = 0xFFFF;
+    struct crc crc = { .high = 0xFF, .low = 0xFF };
+    uint8_t *const end = ring + size;
     uint8_t *out = ring + at, *code = out;          // where the length of the group under way will stand
-    uint8_t group = 0, byte = 0;
+    uint8_t group = 1;
+    if (++out == end)
+        out = ring;
     for (;;) {
-        // A zero, and the frame's first byte, hold the place of the next group's length.
-        if (byte == 0) {
-            *code = group;
-            code = out;
-            group = 0;
-        }
-        group++;
-        *out++ = byte;
-        if (out == ring + size)
-            out = ring;
-        while (left == 0) {
-            if (++part == 1) {
-                from = body;
-                left = body_bytes;
-            } else if (part == 2) {
-                tail[0] = (uint8_t)crc;
-                tail[1] = (uint8_t)(crc >> 8);
-                from = tail;
-                left = sizeof tail;
-            } else {
+        for (; left; left--) {
+            const uint8_t byte = *from++;
+            crc16_byte(&crc, byte);
+            *out = byte;
+            // A zero holds the place of the next group's length.
+            if (byte == 0) {
                 *code = group;
-                *out++ = 0;
-                return (uint16_t)((out == ring + size ? ring : out) - ring);
+                code = out;
+                group = 0;
             }
+            group++;
+            if (++out == end)
+                out = ring;
         }
-        byte = *from++;
-        left--;
-        crc = crc16_byte(crc, byte);
+        if (part == 2)
+            break;
+        from = body;
+        left = body_bytes;
+        if (++part == 2) {
+            edge[0] = crc.low;
+            edge[1] = crc.high;
+            from = edge;
+            left = 2;
+        }
     }
+    *code = group;
+    *out++ = 0;
+    return (uint16_t)((out == end ? ring : out) - ring);
 }
 
 int sg_wire_encode(const struct sg_head *head, const void *body, size_t body_bytes, uint8_t *out)

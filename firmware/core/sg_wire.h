@@ -23,6 +23,7 @@ enum sg_wire_limits {
     SG_WIRE_PACKET_MAX = 70,    // head + body + crc
     SG_WIRE_FRAME_MAX = 72,     // + COBS overhead + delimiter
     SG_WIRE_DATA_MAX = 48,      // bytes of model data in one read or trial-write message
+    SG_WIRE_RATE_LEAST_HZ = 16, // slower, a frame's period would not fit its field
 };
 
 // Requests travel host -> device; the reply has type | SG_REPLY and the request's seq. A request that fails is
@@ -224,7 +225,8 @@ struct sg_model_verdict {
 
 // A frame is `repeats` sensing cycles, whose photocurrents are averaged; a cycle takes period_us.
 struct sg_settings {
-    uint16_t rate_hz;           // frames a second: wanted, and in the reply as in force; 0: as fast as can be
+    uint16_t rate_hz;           // frames a second: wanted, and in the reply as in force; 0: as fast as can be,
+                                // 1..15 are refused
     uint16_t rate_limit_hz;     // reply: the most that this model, these streams and these repeats allow
     uint16_t period_us;         // reply: one sensing cycle, device time
     uint16_t frame_period_us;   // reply: from frame to frame, device time
@@ -232,7 +234,7 @@ struct sg_settings {
     uint8_t repeats;            // 1, 2, 4, 8 or 16
     uint8_t wiring;             // enum sg_wiring
     uint8_t power;              // enum sg_power
-    uint8_t rolling;            // 1: a gaze after every pair of sensors, three a cycle; needs repeats = 1
+    uint8_t rolling;            // 1: a gaze after every pair of sensors, three a cycle: refused, 0 so far
     uint8_t lights;             // 0: off, until set again
 };
 

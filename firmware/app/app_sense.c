@@ -1,0 +1,220 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the sensors need: their exposures, a look at their health, and the probe of a single emitter.
+#include "app.h"
+
+#include <string.h>
+
+#include "sg_rom.h"
+
+enum {
+    EMITTERS_PHOTODIODES = 3,
+    // Cycles of a probe, counted down: until the emitter is alone, its readings, until all is as before.
+    PROBE_BEFORE = 4,
+    PROBE_SUM = SG_LIGHT_REPEATS_MAX,
+    PROBE_AFTER = 4,
+};
+
+// The channel sampled right before each, per wiring (firmware/core/sg_light.h); 255: none.
+static const uint8_t before[2][HAL_CHANNELS] SG_ROM = {
+    { 5, 255, 255, 2, 1, 255 },
+    { 255, 255, 255, 0, 1, 2 },
+};
+
+static struct sg_health health;
+static struct hal_timing timing;        // in force
+static uint16_t wanted_mark;            // CRC of what was asked for: the port may have taken something close to it
+static uint8_t faulty;                  // a channel is
+static uint8_t look;                    // at this channel next
+static uint16_t probe_seq;
+static uint8_t probe_cycles;            // to come
+
+uint8_t app_alarm(void)
+{
+    return hal_alarm() | (app_live.lights ? 0 : (uint8_t)SG_ALARM_LIGHTS_OFF);
+}
+
+uint8_t app_fault(void)
+{
+    return faulty || app_alarm();
+}
+
+void app_faults(uint8_t fault[HAL_CHANNELS])
+{
+    memcpy(fault, health.fault, HAL_CHANNELS);
+}
+
+// Ask the port for the exposures wanted, and for the rest take what it made of them.
+SELDOM static void expose(void)
+{
+    uint16_t cycles[HAL_CHANNELS];
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+        cycles[i] = app.expose.led[i].exposure_cycles;
+    hal_expose(cycles);
+    sg_expose_taken(&app.expose, cycles);
+}
+
+// Begin at these, within what timing and, if they are automatic, the user allow.
+SELDOM static void expose_at(const uint16_t exposure_cycles[HAL_CHANNELS])
+{
+    uint16_t most[HAL_CHANNELS];
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+        most[i] = hal_exposure_most(i);
+        if (app_live.exposure_auto && most[i] > app_live.limit_cycles[i])
+            most[i] = app_live.limit_cycles[i];
+    }
+    sg_expose_start(&app.expose, exposure_cycles, most);
+    expose();
+}
+
+SELDOM static void expose_again(void)
+{
+    uint16_t cycles[HAL_CHANNELS];
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+        cycles[i] = app.expose.led[i].exposure_cycles;
+    expose_at(cycles);
+}
+
+SELDOM static void light_again(void)
+{
+    sg_light_start(&app.light, timing.wiring, timing.period_cycles);
+    sg_light_curve(&app.light, app_live.curve_q10);
+}
+
+static uint16_t mark_of(const struct hal_timing *t)
+{
+    return sg_wire_crc16(0xFFFF, (const uint8_t *)t, sizeof *t);
+}
+
+SELDOM void app_sense_start(const struct hal_timing *begin)
+{
+    timing = *begin;
+    wanted_mark = mark_of(begin);
+    uint16_t cycles[HAL_CHANNELS];
+    memcpy(cycles, app_live.exposure_cycles, sizeof cycles);
+    hal_start(&timing, cycles);
+    light_again();
+    expose_at(app_live.exposure_cycles);
+    sg_health_start(&health);
+}
+
+SELDOM void app_sense_timing(const struct hal_timing *wanted)
+{
+    const uint16_t mark = mark_of(wanted);
+    if (mark == wanted_mark)
+        return;
+    wanted_mark = mark;
+    timing = *wanted;
+    hal_set_timing(&timing);
+    light_again();
+    expose_again();
+}
+
+const struct hal_timing *app_timing(void)
+{
+    return &timing;
+}
+
+SELDOM void app_expose_by(uint8_t op, const uint16_t exposure_us_q4[HAL_CHANNELS])
+{
+    uint16_t cycles[HAL_CHANNELS];
+    if (op == SG_EXPOSURE_GET)
+        return;
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+        cycles[i] = sg_expose_from_us_q4(exposure_us_q4[i]);
+    switch (op) {
+    case SG_EXPOSURE_SET:
+        app_live.exposure_auto = 0;
+        expose_at(cycles);
+        break;
+    case SG_EXPOSURE_LIMIT:
+        memcpy(app_live.limit_cycles, cycles, sizeof cycles);
+        expose_again();
+        break;
+    default:
+        app_live.exposure_auto = op == SG_EXPOSURE_AUTO;
+        expose_again();
+    }
+    app_live_exposed(op == SG_EXPOSURE_SET);
+}
+
+SELDOM static void exposures_moved(void)
+{
+    expose();
+    app_count(&app.exposure_changes);
+}
+
+static void look_at(const struct sg_reading *reading)
+{
+    struct sg_health_sight sight;
+    const uint8_t i = look;
+    const uint8_t first = sg_rom_byte(&before[timing.wiring][i], SG_ROM_FLASH);
+    sight.lit_code = reading->lit_code[i];
+    sight.unlit_code = reading->unlit_code[i];
+    sight.before_code = first < HAL_CHANNELS ? reading->lit_code[first] : 0;
+    sight.exposure_cycles = reading->exposure_cycles[i];
+    sight.most_cycles = hal_exposure_most(i);
+    sight.feature = app.feature[i];
+    sg_track_range(app_model(), i, &sight);
+    faulty = sg_health_look(&health, i, &sight);
+    look = i == HAL_CHANNELS - 1 ? 0 : i + 1;
+}
+
+void app_sense_cycle(const struct hal_cycle *cycle)
+{
+    const struct sg_reading *reading = &cycle->reading;
+    // In the dark there is nothing to learn.
+    if (app_alarm() & (SG_ALARM_LOCKOUT | SG_ALARM_LIGHTS_OFF))
+        return;
+    if (app_live.exposure_auto
+        && sg_expose_cycle(&app.expose, reading->lit_code, reading->unlit_code, reading->exposure_cycles))
+        exposures_moved();
+    look_at(reading);
+}
+
+SELDOM int8_t app_probe(uint8_t emitter, uint16_t seq)
+{
+    if (emitter >= (app_live.wiring == SG_WIRING_LEDS ? (uint8_t)HAL_CHANNELS : (uint8_t)EMITTERS_PHOTODIODES))
+        return SG_E_ARG;
+    if (probe_cycles)
+        return SG_E_BUSY;
+    if (app_alarm() & (SG_ALARM_LOCKOUT | SG_ALARM_LIGHTS_OFF))
+        return SG_E_STATE;
+    probe_seq = seq;
+    probe_cycles = PROBE_BEFORE + PROBE_SUM + PROBE_AFTER;
+    app.probe = emitter;
+    app_rate_renew();
+    return SG_OK;
+}
+
+SELDOM static void probed(void)
+{
+    struct sg_probe *probe = &app_body.probe;
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+        probe->feature[i] = app.light.channel[i].flags & SG_LIGHT_STARVED ? 0 : app.feature[i];
+    probe->emitter = app.probe;
+    probe->reserved = 0;
+    // Not queued only while the line is full of answers: again after the next cycle.
+    if (app_send(SG_MSG_PROBE | SG_REPLY, probe_seq, probe, sizeof *probe, 0)) {
+        probe_cycles--;
+        app.probe = APP_NO_PROBE;
+        app_rate_renew();
+    }
+}
+
+SELDOM static void probe_on(void)
+{
+    if (probe_cycles == PROBE_SUM + PROBE_AFTER + 1 || probe_cycles == PROBE_AFTER + 1 || probe_cycles == 1)
+        sg_light_features(&app.light, app.feature);
+    if (probe_cycles == PROBE_AFTER + 1)
+        probed();
+    else
+        probe_cycles--;
+}
+
+uint8_t app_probing(void)
+{
+    if (!probe_cycles)
+        return 0;
+    probe_on();
+    return 1;
+}
