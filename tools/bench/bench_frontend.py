@@ -86,7 +86,7 @@ def methods(quick, say):
     """The section methods: rows of `bits`, and how far Monte Carlo and closed form are apart."""
     import frontend_methods
 
-    draws = 200 if quick else 1000
+    draws = 500 if quick else 1000
     rows = frontend_methods.table(draws)
     apart = [row["drawn_bits"] - row["random_bits"] for row in rows if (row["random_bits"] or 0) > 1]
     chosen = next(row for row in rows if row["chosen"] and row["photocurrent_na"] == 200 and not row["ambient_na"])

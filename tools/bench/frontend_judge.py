@@ -3,7 +3,7 @@
 
 import sys
 
-BITS_APART = 0.25  # closed form against Monte Carlo of 200 draws: 3.5 standard errors
+BITS_APART = 0.25  # closed form against Monte Carlo of 500 draws: 5 standard errors
 
 
 def bars(report):

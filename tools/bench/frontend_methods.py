@@ -35,7 +35,7 @@ def monte_carlo(method, adc_khz, exposure_us, photocurrent_na, ambient_na, rng, 
     if method.reader != "adc":
         return _drawn_crossings(method, node, exposure_us, photocurrent_na, ambient_na, rng, n)
     lit = _drawn_charge(method, node, adc_khz, lit_q, rng, (1, n))
-    dark = 0.0 if method.name == "cathode_1v1" else _drawn_charge(method, node, adc_khz, unlit_q, rng, (unlit, n))
+    dark = np.zeros((1, 1)) if method.name == "cathode_1v1" else _drawn_charge(method, node, adc_khz, unlit_q, rng, (unlit, n))
     found = lit.mean(0) - np.mean(dark, axis=0)
     if method.bias_v == 0:  # through the forward law: by the slope of charge over current
         found = found / slope(node, exposure_us, photocurrent_na + ambient_na)

@@ -42,8 +42,12 @@ def error(method, adc_khz, exposure_us, photocurrent_na, ambient_na, seed):
     ]
     raw, after = np.array(found).T
     enough = np.isfinite(after).mean() > 0.5
-    rms = [np.sqrt(np.nanmean(raw**2)), np.sqrt(np.nanmean(after**2)) if enough else np.nan]
-    return float(rms[0]), float(rms[1])
+    return _rms(raw), _rms(after) if enough else np.nan
+
+
+def _rms(values):
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else np.nan
 
 
 def one_part(method, adc_khz, exposure_us, photocurrent_na, ambient_na, part):
