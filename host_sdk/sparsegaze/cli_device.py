@@ -36,9 +36,9 @@ def doctor(what, as_json):
 
         checks, bad, unsure = examine(), "MISSING", "optional"
     elif what.endswith(".toml"):
-        from .cli_headset import examine
+        from .cli_headset import examine_headset
 
-        checks, bad, unsure = examine(what), "UNSAFE", "note"
+        return examine_headset(what, Console(as_json))
     else:
         from .doctor_port import examine
 

@@ -6,6 +6,7 @@ permutation of LEDs that brings the matrix nearest to a reference names it. Part
 sensitivity: a factor for each row and each column is always free.
 """
 
+import functools
 import itertools
 import json
 from pathlib import Path
@@ -18,10 +19,13 @@ from .errors import RecordingError, SceneError, SparsegazeError
 from .wire import lib
 
 LEDS = 6
-SWAP_LEAST = 0.12  # octaves rms: a matrix that is as near as this to its reference is not permuted
-SWAP_GAIN = 0.5  # a permutation must leave at most this share of the misfit
-GONE, GONE_PARTS = 2.0, 3.0  # octaves below: dead or covered; the same against a simulated reference
-NO_LIGHT = 4.0  # octaves below the weakest that was seen: what "too little" is taken as
+SWAP_LEAST, SWAP_LEAST_PARTS = 0.12, 0.4  # octaves rms: as near as this to the reference, nothing is swapped;
+# the same for a simulated reference of other parts and another face
+SWAP_GAIN = {6: 0.6, 5: 0.45, 4: 0.3}  # an exchange must leave at most this share, by how many LEDs live
+DEARER = 0.15  # and so much less for each LED beyond two
+GONE, GONE_PARTS = 2.0, 2.5  # octaves below the others: dead or covered
+SEEN_LEAST = 1  # partners; with fewer, nothing is known of an LED
+FAINTER = 0.5  # octaves below the faintest that was seen: where the unseen is taken to be
 
 
 class Diagnosis(NamedTuple):
@@ -105,28 +109,20 @@ def compare(measured, reference, stored=True):
                 )
             ],
         )
-    dead_sensor, dead_emitter = _dead(measured, reference, limit)
-    alive = np.ix_(~dead_sensor, ~dead_emitter)
-    known = np.zeros((LEDS, LEDS), bool)
-    known[alive] = True
-    known &= np.isfinite(measured) & np.isfinite(reference)
-    best, place = _misfit(measured - reference, known), tuple(range(LEDS))
-    own = best
-    if np.isfinite(own) and own > SWAP_LEAST * (1 if stored else 3):
-        whole = ~(dead_sensor | dead_emitter)
-        for order in itertools.permutations(range(LEDS)):
-            moved = np.array(order)
-            if order == tuple(range(LEDS)) or not whole[moved != np.arange(LEDS)].all():
-                continue
-            permuted = reference[np.ix_(moved, moved)]
-            rest = _misfit(measured - permuted, known & np.isfinite(permuted))
-            # The simplest explanation: more LEDs out of place must be worth it.
-            if rest < best * (1 - 0.1 * (np.sum(moved != np.arange(LEDS)) - 2)) and rest < SWAP_GAIN * own:
-                best, place = rest, order
+    depth = np.nanmedian(measured) - np.nanmin(measured) + FAINTER
+    measured_full, reference = _levelled(measured, depth), _levelled(reference, depth)
+    seen = np.isfinite(measured)
+    whole = (seen.sum(axis=1) > SEEN_LEAST) & (seen.sum(axis=0) > SEEN_LEAST)
+    place = _place(measured_full, reference, whole, SWAP_LEAST if stored else SWAP_LEAST_PARTS)
     moved = np.array(place)
-    sensor, emitter = _parts(measured - reference[np.ix_(moved, moved)])
-    findings = _swapped(place) + _gone(dead_sensor, dead_emitter, sensor, emitter)
-    return Diagnosis(place, sensor, emitter, float(best), findings)
+    difference = measured_full - reference[np.ix_(moved, moved)]
+    sensor, emitter = _parts(difference)
+    gone = (
+        (sensor - np.median(sensor) < -limit) | (seen.sum(axis=1) == 0),
+        (emitter - np.median(emitter) < -limit) | (seen.sum(axis=0) == 0),
+    )
+    findings = _swapped(place) + _gone(*gone)
+    return Diagnosis(place, sensor, emitter, _misfit(difference, whole), findings)
 
 
 def save(path, octaves):
@@ -158,49 +154,65 @@ def load(path):
     return matrix
 
 
-def _off_diagonal():
-    return ~np.eye(LEDS, dtype=bool)
+def _levelled(matrix, depth):
+    """The matrix with everything faint, or not seen at all, at one level: `depth` below its median."""
+    floor = np.nanmedian(matrix) - depth
+    out = np.where(np.isfinite(matrix), np.maximum(matrix, floor), floor)
+    np.fill_diagonal(out, np.nan)
+    return out
 
 
-def _filled(measured, reference):
-    """measured - reference; where too little came, as if it were far below the weakest that was seen."""
-    floor = np.nanmin(measured)
-    filled = np.where(np.isfinite(measured), measured, floor - NO_LIGHT)
-    return np.where(np.isfinite(reference) & _off_diagonal(), filled - reference, np.nan)
+def _place(measured, reference, whole, least):
+    """The order of LEDs that brings the reference nearest to what was measured; of those that are `whole`."""
+    order = tuple(range(LEDS))
+    best = own = _misfit(measured - reference, whole)
+    gain = SWAP_GAIN.get(int(whole.sum()))
+    if gain is None or own <= least:
+        return order
+    for candidate in itertools.permutations(range(LEDS)):
+        moved = np.array(candidate)
+        out = moved != np.arange(LEDS)
+        if not out.any() or not whole[out].all():
+            continue
+        rest = _misfit(measured - reference[np.ix_(moved, moved)], whole)
+        # The simplest explanation: each further LED out of place must be worth it.
+        if rest * (1 + DEARER * (out.sum() - 2)) < min(best, gain * own):
+            best, order = rest * (1 + DEARER * (out.sum() - 2)), candidate
+    return order
 
 
 def _parts(difference):
-    """(sensor [6], emitter [6]) of difference ~ sensor + emitter, by medians; about the median of all."""
-    rest = difference - np.nanmedian(difference)
+    """(sensor [6], emitter [6]) of difference ~ sensor + emitter, by medians; NaN on the diagonal."""
+    rest = difference.copy()
     sensor, emitter = np.zeros(LEDS), np.zeros(LEDS)
-    with np.errstate(all="ignore"):
-        for _ in range(10):
-            step = np.nan_to_num(np.nanmedian(rest, axis=1))
-            sensor, rest = sensor + step, rest - step[:, None]
-            step = np.nan_to_num(np.nanmedian(rest, axis=0))
-            emitter, rest = emitter + step, rest - step[None, :]
+    for _ in range(10):
+        for axis, part in ((1, sensor), (0, emitter)):
+            step = np.nanmedian(rest, axis=axis)
+            part += step
+            rest -= step[:, None] if axis else step[None, :]
     shift = np.median(sensor)
     return sensor - shift, emitter + shift
 
 
-def _dead(measured, reference, limit):
-    """(sensors, emitters) bool [6] that are far below what the others let expect."""
-    sensor, emitter = _parts(_filled(measured, reference))
-    return sensor < -limit, emitter - np.median(emitter) < -limit
+def _misfit(difference, whole):
+    """Rms of what is left of difference without a factor of each row and column; of `whole` LEDs."""
+    n = int(whole.sum())
+    if n < 4:
+        return 0.0  # three LEDs: six pairs, six factors
+    rest = difference[np.ix_(whole, whole)]
+    values = rest[~np.eye(n, dtype=bool)]
+    rest = values - _projection(n) @ values
+    return float(np.sqrt(rest @ rest / (n * (n - 1) - 2 * n + 1)))
 
 
-def _misfit(difference, known):
-    """Rms of what is left of difference when a free factor of each row and each column is taken off."""
-    rows, columns = np.nonzero(known)
-    if len(rows) < 12:
-        return np.inf
-    design = np.zeros((len(rows), 2 * LEDS))
+@functools.lru_cache(maxsize=None)
+def _projection(n):
+    """Onto sums of a row's and a column's factor, of the off-diagonal entries of an n x n matrix."""
+    rows, columns = np.nonzero(~np.eye(n, dtype=bool))
+    design = np.zeros((len(rows), 2 * n))
     design[np.arange(len(rows)), rows] = 1
-    design[np.arange(len(rows)), LEDS + columns] = 1
-    values = difference[rows, columns]
-    rest = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
-    spare = max(len(rows) - np.linalg.matrix_rank(design), 1)
-    return float(np.sqrt(rest @ rest / spare))
+    design[np.arange(len(rows)), n + columns] = 1
+    return design @ np.linalg.pinv(design)
 
 
 def _swapped(place):
@@ -224,7 +236,7 @@ def _swapped(place):
     return found
 
 
-def _gone(dead_sensor, dead_emitter, sensor, emitter):
+def _gone(dead_sensor, dead_emitter):
     found = []
     for led in range(LEDS):
         if dead_sensor[led] and dead_emitter[led]:

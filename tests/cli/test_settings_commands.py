@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`settings`, `exposure`, `status`, `doctor PORT`: what is in force, what cannot be, what is wrong."""
+
+import pytest
+from fake_device import linear_model
+
+from sparsegaze import faults
+from sparsegaze.wire import ALARM_NAMES, FAULT_NAMES, lib
+
+
+def test_settings_shows_what_is_in_force_and_the_limit(command, command_json, fake):
+    fake(linear_model(), limit_hz=788)
+    code, data, _ = command_json("settings", "PORT")
+    assert code == 0 and data["rate_limit_hz"] == 788 and data["n_vectors"] == 64
+    assert data["repeats"] == 1 and data["wiring"] == "leds" and data["power"] == "normal"
+    assert data["lights"] is True and data["rolling"] is False
+    code, out, _ = command("settings", "PORT")
+    assert code == 0 and "at most 788 Hz with the model of 64 vectors" in out
+
+
+def test_settings_changes_only_what_was_named_and_waits_until_it_is_stored(command_json, fake):
+    device = fake(linear_model())
+    device.settings(repeats=2, power="low")
+    began = device.t_us
+    code, data, _ = command_json("settings", "PORT", "--rate", "250")
+    assert code == 0 and data["rate_hz"] == pytest.approx(250) and data["repeats"] == 2
+    assert device.sensing["power"] == lib.SG_POWER_LOW and device.t_us - began > 200_000
+    assert command_json("settings", "PORT", "--rate", "max", "--repeats", "1")[1]["rate_hz"] > 1000
+    assert device.sensing["rate_hz"] == 0
+
+
+def test_a_rate_beyond_the_limit_is_refused_by_the_limit_and_changes_nothing(command, fake):
+    device = fake(linear_model(), limit_hz=788)
+    device.settings(rate_hz=500)
+    before = dict(device.sensing)
+    code, out, err = command("settings", "PORT", "--rate", "1000")
+    assert code == 1 and out == ""
+    assert "1000 Hz is too fast: with a model of 64 vectors and one cycle a frame" in err
+    assert "at most 788 Hz" in err
+    assert "--rate 788" in err and "fewer --vectors" in err
+    assert device.sensing == before
+
+
+def test_as_fast_as_can_be_stays_so_when_a_rate_is_refused(command, fake):
+    device = fake(limit_hz=1001)
+    code, _, err = command("settings", "PORT", "--rate", "900", "--repeats", "4")
+    assert code == 1 and "with no model and 4 cycles a frame this device does at most 250 Hz" in err
+    assert device.sensing["rate_hz"] == 0 and device.sensing["repeats"] == 1
+
+
+@pytest.mark.parametrize(
+    "args, word",
+    [
+        (["--rate", "0"], "at least 16"),
+        (["--rate", "15"], "at least 16"),
+        (["--rate", "fast"], "at least 16"),
+        (["--rate", "70000"], "at least 16"),
+        (["--repeats", "3"], "--repeats"),
+        (["--power", "turbo"], "--power"),
+        (["--wiring", "cmos"], "--wiring"),
+        (["--lights", "dim"], "--lights"),
+        (["--rolling", "--repeats", "2"], "--repeats 1 only"),
+    ],
+)
+def test_nonsense_is_refused_before_the_port_is_opened(command, monkeypatch, args, word):
+    monkeypatch.setattr("sparsegaze.device.Device", lambda *_: pytest.fail("the port was opened"))
+    code, out, err = command("settings", "PORT", *args)
+    assert code == 2 and word in err
+
+
+def test_rolling_while_frames_are_means_names_the_way_out(command, fake):
+    fake().settings(repeats=4)
+    code, _, err = command("settings", "PORT", "--rolling")
+    assert code == 1 and "mean of 4 cycles" in err and "--rolling --repeats 1" in err
+
+
+def test_what_the_firmware_refuses_is_said_with_what_it_can(command, fake):
+    fake(refuse=("wiring",), limit_hz=900)
+    code, _, err = command("settings", "PORT", "--wiring", "photodiodes")
+    assert code == 1 and "refuses wiring photodiodes" in err and "nothing was changed" in err
+
+
+def test_lights_off_shows_in_status_with_the_way_back(command, command_json, fake):
+    fake()
+    assert command_json("settings", "PORT", "--lights", "off")[1]["lights"] is False
+    code, out, _ = command("status", "PORT")
+    assert code == 1 and "lights are off by command" in out and "settings PORT --lights on" in out
+    assert command_json("settings", "PORT", "--lights", "on")[0] == 0
+    assert command("status", "PORT")[0] == 0
+
+
+# exposure ---------------------------------------------------------------------------------------------------
+
+
+def test_exposure_shows_sets_holds_limits_and_goes_back_to_automatic(command, command_json, fake):
+    device = fake()
+    code, data, _ = command_json("exposure", "PORT")
+    assert code == 0 and data["exposure_us"] == [50.0] * 6 and data["automatic"] is True
+    code, data, _ = command_json("exposure", "PORT", "--set", "40,40,55.5,60,40,40.03")
+    assert code == 0 and data["exposure_us"] == [40, 40, 55.5, 60, 40, 40.0] and not data["automatic"]
+    assert not data["clipped"]
+    assert command_json("exposure", "PORT", "--auto", "--limit", "90")[1]["automatic"] is True
+    assert device.limits == (90.0,) * 6
+    code, out, _ = command("exposure", "PORT", "--hold")
+    assert code == 0 and "held" in out and not device.automatic
+
+
+def test_an_exposure_that_had_to_be_moved_is_said(command, fake):
+    fake()
+    code, out, err = command("exposure", "PORT", "--set", "1000")
+    assert code == 0 and "330.00" in out and "moved the exposures" in err
+
+
+@pytest.mark.parametrize(
+    "args", [["--set", "10,20"], ["--set", "-5"], ["--set", "long"], ["--limit", "0"], ["--set", "nan"],
+             ["--hold", "--limit", "50"], ["--auto", "--set", "50"]]
+)
+def test_exposures_that_make_no_sense(command, monkeypatch, args):
+    monkeypatch.setattr("sparsegaze.device.Device", lambda *_: pytest.fail("the port was opened"))
+    code, _, err = command("exposure", "PORT", *args)
+    assert code == 2 and "sparsegaze exposure --help" in err
+
+
+# faults -----------------------------------------------------------------------------------------------------
+
+FAULTS = [
+    (dict(fault=(0, 0, 0, lib.SG_FAULT_OPEN, 0, 0)), "open", "sensor 3 is open", "wire to A3"),
+    (dict(fault=(lib.SG_FAULT_SHORT, 0, 0, 0, 0, 0)), "short", "sensor 0 is shorted", "solder bridge at A0"),
+    (dict(fault=(0, 0, lib.SG_FAULT_LOW, 0, 0, 0)), "low", "sensor 2 gets far less light", "probe PORT"),
+    (dict(fault=(0, 0, 0, 0, 0, lib.SG_FAULT_HIGH)), "high", "something lies close before it", "finger"),
+    (dict(alarm=lib.SG_ALARM_SUPPLY, supply_mv=4310), "supply", "4.31 V", "another USB port"),
+    (dict(alarm=lib.SG_ALARM_LOCKOUT), "lockout", "the watchdog had to restart", "wait a second"),
+    (dict(alarm=lib.SG_ALARM_LIGHTS_OFF), "lights-off", "off by command", "--lights on"),
+]
+
+
+@pytest.mark.parametrize("options, name, text, remedy", FAULTS, ids=[row[1] for row in FAULTS])
+def test_status_and_doctor_name_every_fault(command, command_json, fake, options, name, text, remedy):
+    fake(linear_model(), **options)
+    code, data, _ = command_json("status", "PORT")
+    assert code == 1 and data["ok"] is False and [row["name"] for row in data["faults"]] == [name]
+    for args in (["status", "PORT"], ["doctor", "PORT"]):
+        code, out, _ = command(*args)
+        assert code == 1 and text in out and remedy in out
+    assert [row["name"] for row in command_json("info", "PORT")[1]["faults"]] == [name]
+
+
+def test_every_bit_of_the_wire_has_words():
+    assert set(FAULT_NAMES) == {1, 2, 4, 8} and set(FAULT_NAMES.values()) == set(faults.CHANNEL)
+    assert set(ALARM_NAMES) == {1, 2, 4} and set(ALARM_NAMES.values()) == set(faults.BOARD) | {"supply"}
+
+
+def test_a_board_that_is_well(command, command_json, fake):
+    fake(linear_model())
+    code, data, _ = command_json("status", "PORT")
+    assert code == 0 and data["ok"] and data["supply_volts"] == 5.0
+    code, out, _ = command("doctor", "PORT")
+    assert code == 0 and "all six read" in out and "64 vectors" in out and "FAULT" not in out
+    assert "no fault" in command("status", "PORT")[1]
+
+
+def test_doctor_of_a_port_with_nothing_behind_it_is_a_finding_not_a_crash(command):
+    code, out, err = command("doctor", "/dev/no-such-port")
+    assert code == 1 and "FAULT" in out and "no such port" in out and err == ""
+
+
+def test_a_stream_of_faulty_frames_says_so(command, fake):
+    fake(linear_model(), raw_flags=lambda t_us: lib.SG_FLAG_FAULT)
+    code, out, _ = command("stream", "PORT", "--seconds", "1")
+    assert code == 0 and "0.0 % valid" in out and "`sparsegaze status PORT` names it" in out
+
+
+def test_counts_of_a_stream_are_kept_and_replay_does_not_mind(command, command_json, monkeypatch, tmp_path):
+    from bent_sensor import BentSensor
+
+    device = BentSensor(model=linear_model())
+    monkeypatch.setattr("sparsegaze.device.Device", lambda port, *_: device)
+    path, model = tmp_path / "gaze.csv", tmp_path / "eye.sgm"
+    device.model.save(model)
+    assert command_json("stream", "PORT", "--seconds", "1", "--csv", path, "--counts")[0] == 0
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    row = dict(zip(lines[0].split(","), lines[9].split(",")))
+    assert 400 < int(row["lit3"]) < 900 and int(row["unlit3"]) < 10 and float(row["exposure3_us"]) == 50
+    assert command_json("replay", path, "--model", model)[1]["identical"] is True
+    assert command("stream", "PORT", "--counts")[0] == 2
