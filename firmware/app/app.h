@@ -43,6 +43,8 @@ struct app_state {
     uint8_t sensed;                     // a cycle has come
     uint8_t pause;                      // between frames
     uint8_t infer_fits;                 // beside that of every frame, one for a request
+    uint8_t roomy;                      // beside a frame's work, any request
+    uint8_t fresh;                      // a cycle's work has just been done
 };
 extern struct app_state app;
 enum { APP_NO_PROBE = 255 };
@@ -102,7 +104,10 @@ extern union app_body app_body;
 void app_count(uint16_t *counter);                          // up to 65535
 uint8_t app_send(uint8_t type, uint16_t seq, const void *body, uint8_t n, uint8_t keep_free);   // 1 if queued
 void app_describe(struct sg_hello *hello);
-int8_t app_infer_later(const struct sg_infer *point, uint16_t seq);     // SG_OK: answers by itself when done
+void app_infer_later(const struct sg_infer *point, uint16_t seq);       // answers by itself when done
+
+// app_requests.c
+void app_request(const struct sg_head *head, uint8_t n, uint32_t arrived_us);   // its body: app_body, n bytes
 
 // app_sense.c
 void app_sense_start(const struct hal_timing *begin);       // and the port

@@ -15,6 +15,7 @@ enum app_rate_cost {
     COST_PACKET = 700,          // a stream's packet: encoding and the UART's interrupts, and per byte
     COST_BYTE = 105,
     COST_REQUEST = 500,         // what a request may take of a frame
+    COST_ROOMY = 8000,          // the costliest of them
     BIT_CYCLES = 16,            // on the line at 1 Mbaud
     PACKET_BYTES = SG_WIRE_FRAME_MAX - SG_WIRE_BODY_MAX,
 };
@@ -103,13 +104,12 @@ SELDOM static uint32_t shortest(uint16_t *period)
     return frame;
 }
 
-// The timing wanted, and the shortest frame possible.
-SELDOM static uint32_t plan(struct hal_timing *timing)
+// The timing wanted.
+SELDOM void app_rate_start(struct hal_timing *timing)
 {
     const uint8_t shift = repeats_shift();
     memset(timing, 0, sizeof *timing);
-    const uint32_t least = shortest(&timing->period_cycles);
-    uint32_t frame = least;
+    uint32_t frame = shortest(&timing->period_cycles);
     if (app_live.rate_hz) {
         const uint32_t wanted = divided(CYCLES_PER_S, app_live.rate_hz);
         if (frame < wanted)
@@ -120,21 +120,18 @@ SELDOM static uint32_t plan(struct hal_timing *timing)
         const uint32_t each = frame >> shift;
         timing->period_cycles = each > PERIOD_MOST ? PERIOD_MOST : whole_slots((uint16_t)each);
     }
-    timing->sleep = app_live.power == SG_POWER_LOW;
     timing->frame_cycles = frame;
     timing->repeats = app_live.repeats;
     timing->wiring = app_live.wiring;
     timing->lights = app_live.lights;
     timing->probe = app.probe;
-    return least;
-}
-
-SELDOM void app_rate_start(struct hal_timing *timing)
-{
-    const uint32_t least = plan(timing);
-    app.infer_fits = timing->frame_cycles - least >= infer_cycles();
-    // Darkness that is more than a small part of a cycle.
-    app.pause = timing->frame_cycles - ((uint32_t)timing->period_cycles << repeats_shift()) > PERIOD_LEAST / 64;
+    timing->sleep = app_live.power == SG_POWER_LOW;
+    // What is left of the time until the next frame's first cycle is complete.
+    const uint32_t dark = frame - ((uint32_t)timing->period_cycles << shift);
+    const uint32_t spare = dark + timing->period_cycles - work_cycles();
+    app.pause = dark > PERIOD_LEAST / 64;
+    app.infer_fits = !app.sensed || spare >= infer_cycles();
+    app.roomy = !app.sensed || spare >= COST_ROOMY;
 }
 
 SELDOM void app_rate_renew(void)

@@ -132,7 +132,7 @@ SELDOM static int8_t trial_write(uint8_t n)
 }
 
 // `body` holds the n bytes of the request, and then its answer.
-SELDOM static void request(const struct sg_head *head, uint8_t n, uint32_t arrived_us)
+SELDOM void app_request(const struct sg_head *head, uint8_t n, uint32_t arrived_us)
 {
     uint8_t answer_bytes = 0;
     int8_t result = SG_OK;
@@ -167,7 +167,7 @@ SELDOM static void request(const struct sg_head *head, uint8_t n, uint32_t arriv
         answer_bytes = sizeof app_body.mode;
         break;
     case SG_MSG_INFER:
-        result = app_infer_later(&app_body.infer, head->seq);
+        app_infer_later(&app_body.infer, head->seq);
         answered = 1;
         break;
     case SG_MSG_MODEL_INFO:
@@ -245,12 +245,4 @@ SELDOM static void request(const struct sg_head *head, uint8_t n, uint32_t arriv
         app_rate_renew();
         hal_after_sending(app.slow_line ? HAL_AFTER_BAUD_500K : HAL_AFTER_BAUD_1M);
     }
-}
-
-void app_on_byte(uint8_t byte, uint32_t zero_us)
-{
-    struct sg_head head;
-    const int n = sg_link_receive(&app.link, byte, &head, app_body.bytes);
-    if (n >= 0)
-        request(&head, (uint8_t)n, zero_us);
 }

@@ -51,14 +51,11 @@ static void send_stream(uint8_t type, const void *body, uint8_t n)
         app_count(&app.tx_dropped);
 }
 
-SELDOM int8_t app_infer_later(const struct sg_infer *point, uint16_t seq)
+SELDOM void app_infer_later(const struct sg_infer *point, uint16_t seq)
 {
-    if (asked.waiting)
-        return SG_E_BUSY;
     asked.point = *point;
     asked.seq = seq;
     asked.waiting = 1;
-    return SG_OK;
 }
 
 // What takes as long as an inference and is done in the place of one, or when there is time for both: 1 if there
@@ -74,6 +71,24 @@ NOT_KEPT static uint8_t long_work(void)
     if (app_send(SG_MSG_INFER | SG_REPLY, asked.seq, &app_body.gaze, sizeof app_body.gaze, 0))
         asked.waiting = 0;
     return 1;
+}
+
+uint8_t app_listens(void)
+{
+    return !asked.waiting && (app.roomy || app.fresh);
+}
+
+void app_on_byte(uint8_t byte, uint32_t zero_us)
+{
+    struct sg_head head;
+    const int n = sg_link_receive(&app.link, byte, &head, app_body.bytes);
+    if (n < 0)
+        return;
+    app_request(&head, (uint8_t)n, zero_us);
+    app.fresh = 0;
+    // Inference goes deepest: not from inside of a request.
+    if (app.infer_fits)
+        long_work();
 }
 
 // Compared with the frame before, as sensed.
@@ -200,7 +215,10 @@ static void take(const struct hal_cycle *cycle)
 
 void app_on_cycle(const struct hal_cycle *cycle)
 {
-    app.sensed = 1;
+    if (!app.sensed) {                  // what follows has to share the time with frames
+        app.sensed = 1;
+        app_rate_renew();
+    }
     take(cycle);
     const uint8_t last = cycle->left == 0;
     if (app_probing()) {
@@ -216,6 +234,7 @@ void app_on_cycle(const struct hal_cycle *cycle)
     if (last)
         taken = 0;
     app_live_cycle(cycle->t_us);
+    app.fresh = 1;
 }
 
 SELDOM void app_describe(struct sg_hello *hello)
@@ -247,7 +266,8 @@ int main(void)
 {
     start();
     while (hal_poll()) {
-        if (!app.sensed || app.infer_fits)
+        app.fresh = 0;
+        if (app.infer_fits)
             long_work();
         app_models_step();
         app_live_step();

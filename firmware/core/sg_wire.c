@@ -23,50 +23,53 @@ uint16_t sg_wire_crc16(uint16_t crc, const uint8_t *data, size_t n)
     return (uint16_t)(((uint16_t)now.high << 8) | now.low);
 }
 
+// COBS into a ring. A packet has at most 70 bytes, so no group reaches the 254 bytes at which COBS needs a second
+// rule.
+struct out {
+    uint8_t *next;
+    uint8_t *code;              // where the length of the group under way will stand
+    uint8_t *ring;
+    uint8_t *end;
+    uint8_t group;
+};
+
+static inline void out_byte(struct out *out, uint8_t byte)
+{
+    *out->next = byte;
+    // A zero holds the place of the next group's length.
+    if (byte == 0) {
+        *out->code = out->group;
+        out->code = out->next;
+        out->group = 0;
+    }
+    out->group++;
+    if (++out->next == out->end)
+        out->next = out->ring;
+}
+
 uint16_t sg_wire_encode_ring(const struct sg_head *head, const void *body, uint8_t body_bytes, uint8_t *ring,
                              uint16_t size, uint16_t at)
 {
-    // A packet has at most 70 bytes, so no group reaches the 254 bytes at which COBS needs a second rule.
-    uint8_t edge[SG_WIRE_HEAD_BYTES] = {    // head, and in the end the CRC
-        (uint8_t)head->seq, (uint8_t)(head->seq >> 8), head->type, head->flags,
-    };
-    const uint8_t *from = edge;
-    uint8_t left = SG_WIRE_HEAD_BYTES, part = 0;    // head, body, CRC
+    struct out out = { .next = ring + at, .code = ring + at, .ring = ring, .end = ring + size, .group = 0 };
     struct crc crc = { .high = 0xFF, .low = 0xFF };
-    uint8_t *const end = ring + size;
-    uint8_t *out = ring + at, *code = out;          // where the length of the group under way will stand
-    uint8_t group = 1;
-    if (++out == end)
-        out = ring;
-    for (;;) {
+    // All that is sent lies in memory as on the wire.
+    const uint8_t *from = (const uint8_t *)head;
+    uint8_t left = SG_WIRE_HEAD_BYTES;
+    out_byte(&out, 1);
+    for (uint8_t part = 0; part < 2; part++) {
         for (; left; left--) {
             const uint8_t byte = *from++;
             crc16_byte(&crc, byte);
-            *out = byte;
-            // A zero holds the place of the next group's length.
-            if (byte == 0) {
-                *code = group;
-                code = out;
-                group = 0;
-            }
-            group++;
-            if (++out == end)
-                out = ring;
+            out_byte(&out, byte);
         }
-        if (part == 2)
-            break;
         from = body;
         left = body_bytes;
-        if (++part == 2) {
-            edge[0] = crc.low;
-            edge[1] = crc.high;
-            from = edge;
-            left = 2;
-        }
     }
-    *code = group;
-    *out++ = 0;
-    return (uint16_t)((out == end ? ring : out) - ring);
+    out_byte(&out, crc.low);
+    out_byte(&out, crc.high);
+    *out.code = out.group;
+    *out.next = 0;
+    return (uint16_t)((++out.next == out.end ? ring : out.next) - ring);
 }
 
 int sg_wire_encode(const struct sg_head *head, const void *body, size_t body_bytes, uint8_t *out)
