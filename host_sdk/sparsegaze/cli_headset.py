@@ -51,7 +51,7 @@ def _safety_lines(headset, report):
             report.worst.quantity,
         )
     else:
-        most = max(p.intensity_mw_sr for p in headset.emitters) * report.margin
+        most = 0.99 * max(p.intensity_mw_sr for p in headset.emitters) * report.margin
         yield "NOT SAFE -> emitters of at most %.3g mW/sr at that current: less current, or others" % most
     for sentence in report.assumed:
         yield "  - " + sentence

@@ -59,7 +59,7 @@ class Row:
 
     @property
     def ok(self):
-        return self.value <= self.limit
+        return bool(self.value <= self.limit)
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ def examine(headset, person=None, default=Timing()):
         each = zip(emitters, milliwatts * duty, distances)
         found = [_radiance(p, mw, seconds, d, smallest) for p, mw, d in each]
         value, limit = max(found, key=lambda pair: pair[0] / pair[1])
-        rows.append(Row(case, "retina, " + name, value, limit, "W/m2/sr", detail))
+        rows.append(Row(case, "retina, " + name, float(value), float(limit), "W/m2/sr", detail))
 
     always = 2 * LONG_S
     pulse_s, duty = default.lit_s(), default.emitter_duty(headset)

@@ -55,6 +55,27 @@ def test_every_led_of_the_default_headset_senses_once_with_the_four_others_lit(l
         assert not led2gaze.lit[np.ix_(phase.sense, phase.sense)].any()
 
 
+def test_the_photodiode_headset_is_six_sensors_each_lit_by_one_of_three_emitters(repo_root):
+    headset = load_headset(repo_root / "headsets" / "nextgaze_nano.toml")
+    assert [p.pin for p in headset.sensors] == ["A0", "A1", "A2", "A3", "A4", "A5"]
+    assert [p.pin for p in headset.emitters] == ["D2", "D3", "D4"]
+    assert headset.lit.astype(int).tolist() == [[1, 0, 0], [0, 1, 0], [0, 0, 1]] * 2
+    places = np.array([p.position_mm for p in headset.sensors + headset.emitters])
+    apart = np.linalg.norm(places[:, None] - places, axis=-1) + 100 * np.eye(9)
+    assert apart.min() > 5.5, "parts of 5 mm fit beside each other"
+    assert (places[:, 1] < 3).all(), "none above the eye: lashes"
+
+
+def test_the_photodiodes_see_the_eye_turn(repo_root):
+    headset = load_headset(repo_root / "headsets" / "nextgaze_nano.toml")
+    for person in (nominal_person(), draw_person(3)):
+        scene = Scene(headset, person, quality={"face": 0.2})
+        looks = [headset.collect(scene.response(*gaze)) for gaze in ((-15, 0), (15, 0), (0, -15), (0, 15))]
+        across, up = np.log(looks[1] / looks[0]), np.log(looks[3] / looks[2])
+        assert np.abs(across).max() > 0.2 and np.abs(up).max() > 0.2
+        assert np.linalg.matrix_rank(np.column_stack([across, up]), tol=0.2) == 2, "two axes, not one"
+
+
 def test_without_phases_a_sensor_collects_from_whoever_stands_elsewhere(led2gaze):
     assert (replace(led2gaze, phases=()).lit == ~np.eye(6, dtype=bool)).all()
     apart = pair(port((12, 0, -30)), port((10, -10, -30)))
