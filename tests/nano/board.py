@@ -74,6 +74,21 @@ def firmware(name, start=0, define=()):
     return out
 
 
+def uniform_map(path, level=1.0, emitters=6, pattern=None):
+    """A response map that the eye's state does not change: `level`, or `pattern` [6][emitters]; its path."""
+    import numpy
+
+    from sparsegaze import mapfile
+
+    gaze = numpy.linspace(-30.0, 30.0, 4)
+    values = numpy.full((6, emitters), level) if pattern is None else numpy.asarray(pattern, float)
+    mapfile.write_map(path, pupil_mm=3.5, lid_opening=1.0, slip_mm=(0.0, 0.0, 0.0), elevation_deg=gaze,
+                      azimuth_deg=gaze, smooth=numpy.broadcast_to(values, (1, 1, 1, 1, 1, 4, 4, 6, emitters)),
+                      glint_lid_opening=1.0, glint_elevation_deg=gaze, glint_azimuth_deg=gaze,
+                      glint=numpy.zeros((1, 1, 1, 1, 4, 4, 6, emitters)))
+    return path
+
+
 class Board:
     """One running vheadset. In lockstep unless paced; `with Board(...) as board`."""
 

@@ -5,7 +5,7 @@ import struct
 
 import pytest
 
-from board import FOLDER, QUIET, Board, firmware, physics
+from board import FOLDER, QUIET, Board, firmware, physics, uniform_map
 from test_leds import SAMPLER, charge_pc, exposure
 
 # Read and checked, but the board does nothing with them: README.md, "Where each constant acts".
@@ -117,27 +117,13 @@ def test_lid_follow_gain_reaches_the_simulated_person_and_the_unit_of_light_the_
     assert "map_reference" not in configs[2]    # a map that is given is its own reference
 
 
-def flat_map(path, level):
-    """A map on which every emitter gives every sensor `level`: its mean is five times that."""
-    import numpy
-
-    from sparsegaze import mapfile
-
-    gaze = numpy.linspace(-30.0, 30.0, 4)
-    mapfile.write_map(path, pupil_mm=3.5, lid_opening=1.0, slip_mm=(0.0, 0.0, 0.0), elevation_deg=gaze,
-                      azimuth_deg=gaze, smooth=numpy.full((1, 1, 1, 1, 1, 4, 4, 6, 6), level),
-                      glint_lid_opening=1.0, glint_elevation_deg=gaze, glint_azimuth_deg=gaze,
-                      glint=numpy.zeros((1, 1, 1, 1, 4, 4, 6, 6)))
-    return path
-
-
 @pytest.mark.parametrize("light,na", [("dim", 75), ("nominal", 200), ("bright", 600)])
 @pytest.mark.parametrize("level,reference,factor", [
     (1.0, None, 1), (0.25, None, 1), (1.0, 5.0, 1), (0.25, 5.0, 0.25), (2e-6, 2e-5, 0.5)])
 def test_map_reference_is_the_mean_that_gives_the_nominal_current(tmp_path, light, na, level, reference,
                                                                   factor):
     keys = {} if reference is None else {"map_reference": reference}
-    with Board(app=firmware("adc"), constants=QUIET, map=flat_map(tmp_path / "flat.sgmap", level), light=light,
+    with Board(app=firmware("adc"), constants=QUIET, map=uniform_map(tmp_path / "flat.sgmap", level), light=light,
                **keys) as board:
         _, seconds, _, held = exposure(board, lit=0b111110, ticks=1000)
     collected = charge_pc(held, SAMPLER)

@@ -58,6 +58,12 @@ def exposure(board, lit=0, flags=0, ticks=1000, dark=0):
     return code, (sampled - released) / 16e6, dark_s, held
 
 
+def lit_cycles(board):
+    """Cycles from lights on to lights out of the last exposure with DARK."""
+    marks = [int(line.split(",")[1]) for line in board.log.read_text().splitlines() if line.startswith("sample")]
+    return marks[1] - marks[0]
+
+
 def bench(**constants):
     return Board(app=firmware("adc"), constants=dict(QUIET, **constants))
 
@@ -183,20 +189,6 @@ def test_part_spread_and_seed_change_the_photocurrent():
             board.command("set ambient sun_gap")
             held.append(exposure(board, ticks=300)[3])
     assert held[0] == held[1] != held[2]
-
-
-@pytest.fixture(scope="module")
-def flat_map(tmp_path_factory):
-    """A map on which every emitter gives every sensor the same, whatever the eye does."""
-    from sparsegaze import mapfile
-
-    path = tmp_path_factory.mktemp("map") / "flat.sgmap"
-    gaze = numpy.linspace(-30.0, 30.0, 4)
-    mapfile.write_map(path, pupil_mm=3.5, lid_opening=1.0, slip_mm=(0.0, 0.0, 0.0), elevation_deg=gaze,
-                      azimuth_deg=gaze, smooth=numpy.ones((1, 1, 1, 1, 1, 4, 4, 6, 6)), glint_lid_opening=1.0,
-                      glint_elevation_deg=gaze, glint_azimuth_deg=gaze,
-                      glint=numpy.zeros((1, 1, 1, 1, 4, 4, 6, 6)))
-    return path
 
 
 @pytest.mark.parametrize("lit", [0b000010, 0b010100, 0b111110])

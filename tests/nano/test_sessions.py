@@ -50,7 +50,7 @@ def test_parts_are_the_same_in_every_session_and_noise_is_not(tmp_path):
                            "adc.inl_lsb": 0.5, "adc.offset_lsb": 2, "adc.gain_error": 0.005,
                            "clock.error": 0.01})
     held = {}
-    for name, constants in (("parts", parts), ("noise", dict(parts, **{"supply.ripple_mv": 5}))):
+    for name, constants in (("parts", parts), ("noise", dict(parts, rail_noise_mv=5))):
         for _ in range(2):
             with Board(app=firmware("adc"), constants=constants, state=tmp_path / name) as board:
                 board.command("motion 0")

@@ -15,11 +15,13 @@ struct charge_node {
     double rail_volts;
 };
 
-// Illuminated, the junction stops at a forward voltage: V is never above rail_volts + this.
+// Illuminated, the junction stops at a forward voltage: where there is one, V is never above rail_volts + this.
 extern const double CHARGE_CEILING_VOLTS;
 
-// volts <= rail_volts + CHARGE_CEILING_VOLTS.
+// volts <= rail_volts + CHARGE_CEILING_VOLTS where there is a junction.
 double charge_pc(struct charge_node node, double volts);
+// At the ceiling; infinite without a junction.
+double charge_ceiling_pc(struct charge_node node);
 // Its inverse, to 1e-12 V, by Newton's method; the ceiling for a charge above that of the ceiling.
 double charge_volts(struct charge_node node, double charge_pc);
 // dq/dV.

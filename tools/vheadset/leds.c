@@ -115,10 +115,8 @@ static double current_na(struct leds *l, int i, uint64_t from, uint64_t to)
 static void collect(struct leds *l, int i, uint64_t to)
 {
     struct led *led = &l->led[i];
-    struct charge_node node = node_of(l, i, 0);
-    double ceiling_pc = charge_pc(node, node.rail_volts + CHARGE_CEILING_VOLTS);
     led->charge_pc += current_na(l, i, led->since, to) * (double)(to - led->since) / 16.0 * 1e-3;
-    led->charge_pc = fmin(led->charge_pc, ceiling_pc);
+    led->charge_pc = fmin(led->charge_pc, charge_ceiling_pc(node_of(l, i, 0)));
 }
 
 // Charge a node through the pull-up, until the junction conducts; photocurrent is negligible beside it.
@@ -154,13 +152,19 @@ static void bring_all(struct leds *l, uint64_t to)
         bring_to(l, i, to);
 }
 
+// What a node keeps that was at some voltage: nothing above its ceiling.
+static double charge_at(struct charge_node node, double volts)
+{
+    bool above = node.junction_pf > 0 && volts > node.rail_volts + CHARGE_CEILING_VOLTS;
+    return above ? charge_ceiling_pc(node) : charge_pc(node, volts);
+}
+
 // A node that was at some voltage begins to keep its charge.
 static void let_go(struct leds *l, int i, double volts)
 {
     struct led *led = &l->led[i];
-    struct charge_node node = node_of(l, i, rail_noise(l, NOISE_RAIL_RELEASE, l->releases++));
     led->volts = volts;
-    led->charge_pc = charge_pc(node, fmin(volts, node.rail_volts + CHARGE_CEILING_VOLTS));
+    led->charge_pc = charge_at(node_of(l, i, rail_noise(l, NOISE_RAIL_RELEASE, l->releases++)), volts);
 }
 
 static enum led_drive drive_of(const struct leds *l, int i)
@@ -199,7 +203,7 @@ static struct lamps_on emitters_on(struct leds *l)
     for (int i = 0; i < LEDS_COUNT; i++) {
         enum led_fault fault = part_of(l, i)->fault;
         uint8_t *which = fault == FAULT_SHORT ? &on.shorted : fault == FAULT_SHORT_GROUND ? &on.grounded : &on.lit;
-        if (l->led[i].drive == LED_HIGH && fault != FAULT_OPEN)
+        if (drive_of(l, i) == LED_HIGH && fault != FAULT_OPEN)
             *which |= (uint8_t)(1 << i);
     }
     return on;
@@ -208,11 +212,6 @@ static struct lamps_on emitters_on(struct leds *l)
 static void pins_changed(struct leds *l, uint64_t now)
 {
     leds_settle(l, now);
-    for (int i = 0; i < LEDS_COUNT; i++) {
-        enum led_drive drive = drive_of(l, i);
-        if (drive != LED_FLOAT)
-            enter(l, i, drive, now);
-    }
     lamps_switch(&l->lamps, emitters_on(l), now);
     for (int i = 0; i < LEDS_COUNT; i++)     // released against the rail of the new lights
         enter(l, i, drive_of(l, i), now);
@@ -229,8 +228,7 @@ static void rewire(struct leds *l, const double *volts, uint64_t cycle)
 {
     for (int i = 0; i < LEDS_COUNT; i++)
         if (l->led[i].drive == LED_FLOAT)
-            l->led[i].charge_pc = charge_pc(node_of(l, i, 0),
-                                            fmin(volts[i], l->lamps.rail_volts + CHARGE_CEILING_VOLTS));
+            l->led[i].charge_pc = charge_at(node_of(l, i, 0), volts[i]);
     lamps_switch(&l->lamps, emitters_on(l), cycle);
 }
 

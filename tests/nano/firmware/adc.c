@@ -10,9 +10,10 @@
 //   'I'                    interrupts counted while free running for 10 conversions' time
 //   'X' lit, flags, ticks16, dark16   an exposure of LED 0, held low before, to OCR1B = ticks: code16
 //        flags 1: pull-up on   2: sample capacitor from LED 1, high   4: lights out at `dark` ticks
-//        8: prescaler 64   16: against the bandgap   32: mark the lights, port D's instead of port C's
+//        8: prescaler 64   16: against the bandgap   32: lights of port D, not of port C
+//        GPIOR1 = 2 right after lights on and lights out, 1 right after the release
 //   'Q' n, slot16, admux...  n conversions at prescaler 64, one every slot cycles by Timer1 compare B, the
-//        multiplexer moved on 80 cycles after each match: n code16
+//        multiplexer moved on 80 cycles after each match, all nodes let go just before: n code16
 #include "bench.h"
 
 enum { SLOW = _BV(ADEN) | _BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0), FAST = _BV(ADEN) | _BV(ADPS2) | _BV(ADPS1) };
@@ -155,7 +156,9 @@ static void expose(void)
     if (flags & 32)
         PORTD = lit;
     lit = flags & 32 ? 0 : lit & 0x3E;
-    PORTC = lit;
+    __asm__ volatile("out %[port], %[lit]\n\tout %[mark], %[two]"
+                     : : [port] "I"(_SFR_IO_ADDR(PORTC)), [lit] "r"(lit), [mark] "I"(_SFR_IO_ADDR(GPIOR1)),
+                       [two] "r"((uint8_t)2));
     __builtin_avr_delay_cycles(80);
     arm(ticks);
     if (flags & 8)
@@ -191,11 +194,12 @@ static void slots(void)
     uint16_t slot = get16(), codes[20];
     for (uint8_t i = 0; i < n && i < 20; i++)
         admux[i] = bench_get();
-    DDRC = 0;
     PORTC = 0;
+    DDRC = 0x3F;
     arm(slot);
     ADMUX = admux[0];
     ADCSRA = FAST | _BV(ADATE) | _BV(ADIF);
+    DDRC = 0;
     __asm__ volatile("out %[mark], %[one]\n\tsts %[ctl], %[one]"
                      : : [mark] "I"(_SFR_IO_ADDR(GPIOR1)), [one] "r"((uint8_t)1),
                        [ctl] "i"(_SFR_MEM_ADDR(TCCR1B)));
@@ -203,9 +207,10 @@ static void slots(void)
         while (!(TIFR1 & _BV(OCF1B)))
             ;
         __builtin_avr_delay_cycles(80);
-        if (i + 1 < n)
+        if (i + 1 < n) {
             ADMUX = admux[i + 1];
-        OCR1B = (uint16_t)((i + 2) * slot);
+            OCR1B = (uint16_t)((i + 2) * slot);
+        }
         TIFR1 = _BV(OCF1B);
         while (!(ADCSRA & _BV(ADIF)))
             ;
