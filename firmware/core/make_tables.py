@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Write the constant tables of the core: sg_gp_table.c, sg_mlp_table.c, sg_expose_table.h, sg_crc32_table.h.
+"""Write the constant tables of the core: sg_gp_table.c, sg_mlp_table.c, sg_light_table.[ch], sg_crc32_table.h.
 
     python3 firmware/core/make_tables.py            write them beside this script
     python3 firmware/core/make_tables.py --check    exit 1 if a committed file differs
@@ -15,43 +15,21 @@ JUNCTION_V = 0.7          # C(V) = C0 / (1 + V / 0.7 V) ** 0.4
 JUNCTION_POWER = 0.4
 PIN_PF = 6.0
 SAMPLE_HOLD_PF = 14.0
-SUPPLY_V = 5.0
-CODES_Q2 = 4096           # sum of four readings of 10 bits: quarters of an ADC step
+RAIL_V = 2.5              # what the cathodes rest on
+REFERENCE_V = 1.1
 TIMER_HZ = 16.0e6
 UNIT_A = 62.5e-12         # feature 0
 FEATURE_PER_OCTAVE = 4096
+CODE_UNIT = 32            # charges and codes are counted in 1/32 of a code
 
-# Of all charge on the node. The sample capacitor joins last and lifts what is nearly empty: 0.64 can be told
-# apart, and a window of WINDOW_RATIO above the goal must fit into it.
-GOAL_FRACTION = 0.30
-WINDOW_RATIO = 2.1        # either way; above the 1.9 that gaze alone moves the light
+# Ambient light: exact at this frequency, so nearly at 100 and 120 Hz. An unlit sample comes 3 of 18 slots after
+# the lit one.
+FLICKER_HZ = 110.0
+LIT_BEFORE_UNLIT = 3.0 / 18.0
+PERIOD_FROM, PERIOD_STEP, PERIOD_NODES = 15984, 2048, 9
 
 LICENSE = "// SPDX-License-Identifier: Apache-2.0\n"
 MADE_BY = "// Made by make_tables.py; edit that.\n"
-
-
-def node_charge_pc(volts):
-    """Charge on the node at a reverse voltage, pC: F(V) = Qj(V) + (C_pin + C_sh) V."""
-    power = 1.0 - JUNCTION_POWER
-    junction = JUNCTION_PF * JUNCTION_V / power * ((1.0 + volts / JUNCTION_V) ** power - 1.0)
-    return junction + (PIN_PF + SAMPLE_HOLD_PF) * volts
-
-
-def collected_pc(code_q2):
-    """Charge collected when the node ends at a reading in quarters of a code (may be fractional), pC."""
-    return node_charge_pc(SUPPLY_V) - node_charge_pc(SUPPLY_V * code_q2 / CODES_Q2)
-
-
-def code_at(charge_pc):
-    """Reading, in quarters of a code, at which a charge has been collected, by bisection; fractional."""
-    low, high = 0.0, float(CODES_Q2)
-    for _ in range(60):
-        middle = (low + high) / 2
-        if collected_pc(middle) > charge_pc:
-            low = middle
-        else:
-            high = middle
-    return low
 
 
 def rounded(x):
@@ -101,54 +79,98 @@ def mlp_table():
             "const uint16_t sg_mlp_tanh_table[257] SG_ROM = {\n" + rows(tanh_table()) + "};\n")
 
 
-def capacitance_log2():
-    """log2 of the mean capacitance over a drop of 16*i codes (64*i quarters), with every constant of the feature, Q4.12."""
-    per_quarter_v = SUPPLY_V / CODES_Q2
-    nodes = []
-    for i in range(65):
-        drop = max(64 * i, 1e-6)
-        mean_pf = collected_pc(CODES_Q2 - drop) / (drop * per_quarter_v)
-        per_quarter_c = mean_pf * 1e-12 * per_quarter_v
-        nodes.append(rounded(FEATURE_PER_OCTAVE * math.log2(per_quarter_c * TIMER_HZ / UNIT_A)))
-    return nodes
+def capacitance_at_rest_pf():
+    """Of a node at 0 V, the sample capacitor included."""
+    return JUNCTION_PF * (1.0 + RAIL_V / JUNCTION_V) ** -JUNCTION_POWER + PIN_PF + SAMPLE_HOLD_PF
 
 
-def expose_table():
-    """Text of sg_expose_table.h."""
-    mantissa = [rounded(FEATURE_PER_OCTAVE * math.log2(1 + i / 64)) for i in range(65)]
-    goal_pc = node_charge_pc(SUPPLY_V) * GOAL_FRACTION
-    goal_feature = rounded(FEATURE_PER_OCTAVE * math.log2(goal_pc * 1e-12 * TIMER_HZ / UNIT_A))
-    return (LICENSE + MADE_BY + "#ifndef SG_EXPOSE_TABLE_H\n#define SG_EXPOSE_TABLE_H\n\n"
+def charge_codes(code):
+    """Charge on a node that reads `code`, in codes at the capacitance at rest."""
+    power = 1.0 - JUNCTION_POWER
+
+    def junction_pc(reverse):
+        return JUNCTION_PF * JUNCTION_V / power * (1.0 + reverse / JUNCTION_V) ** power
+
+    volts = REFERENCE_V * code / 1024
+    charge_pc = junction_pc(RAIL_V) - junction_pc(RAIL_V - volts) + (PIN_PF + SAMPLE_HOLD_PF) * volts
+    return charge_pc / (capacitance_at_rest_pf() * REFERENCE_V / 1024)
+
+
+def curvature():
+    """(k1, k2) of charge = code (1 + k1 x + k2 x^2), x = code / 1024: least squares over codes 0..1000."""
+    sums = [[0.0] * 3 for _ in range(2)]
+    for code in range(1001):
+        x = code / 1024
+        basis = (code * x, code * x * x)
+        excess = charge_codes(code) - code
+        for i in range(2):
+            for j in range(2):
+                sums[i][j] += basis[i] * basis[j]
+            sums[i][2] += basis[i] * excess
+    (a, b, e), (c, d, f) = sums
+    return (e * d - b * f) / (a * d - b * c), (a * f - e * c) / (a * d - b * c)
+
+
+def flicker_weights(period_cycles):
+    """(b, c) of sg_light.h: weights of the previous unlit code and of the one before it."""
+    turn = 2 * math.pi * FLICKER_HZ * period_cycles / TIMER_HZ
+    back = turn * LIT_BEFORE_UNLIT
+    before = math.sin(back / 2) * math.sin(turn - back / 2) / math.sin(turn / 2) ** 2
+    earlier = -math.sin(back / 2) * math.sin((turn - back) / 2) / (math.sin(turn) * math.sin(turn / 2))
+    return before, earlier
+
+
+def light_table():
+    """Text of sg_light_table.h."""
+    unit_a = capacitance_at_rest_pf() * 1e-12 * REFERENCE_V / 1024 / CODE_UNIT * TIMER_HZ
+    weights = [flicker_weights(PERIOD_FROM + PERIOD_STEP * i) for i in range(PERIOD_NODES)]
+    k1, k2 = curvature()
+    return (LICENSE + MADE_BY + "#ifndef SG_LIGHT_TABLE_H\n#define SG_LIGHT_TABLE_H\n\n"
             '#include <stdint.h>\n\n#include "sg_rom.h"\n\n'
-            "// 4096 * log2(1 + i / 64)\n"
-            "static const uint16_t log2_mantissa_q12[65] SG_ROM = {\n" + rows(mantissa) + "};\n\n"
-            "// 4096 * log2(mean capacitance over a drop of 64 * i quarter codes), so that the sum is a feature\n"
-            "static const uint16_t log2_capacitance_q12[65] SG_ROM = {\n" + rows(capacitance_log2()) +
-            "};\n\n// The charge to aim at: the feature it would have after 1 cycle. Where the window ends.\n"
-            f"#define GOAL_Q12 {goal_feature}L\n"
-            f"#define BRIGHT_CODE_Q2 {rounded(code_at(goal_pc * WINDOW_RATIO))}U  // goal * {WINDOW_RATIO}\n"
-            f"#define DIM_CODE_Q2 {rounded(code_at(goal_pc / WINDOW_RATIO))}U  // goal / {WINDOW_RATIO}\n"
-            "\n#endif\n")
+            f"// Feature of 1/{CODE_UNIT} code collected in 1 cycle.\n"
+            f"#define UNIT_Q12 {rounded(FEATURE_PER_OCTAVE * math.log2(unit_a / UNIT_A))}L\n\n"
+            "// Curvature of sg_light_loop.c, Q0.16: 2 k1; the same and half a step of x in 3 k2 x; 4 steps of that.\n"
+            f"#define TWICE_K1_Q16 {rounded(2 * k1 * 65536)}\n"
+            f"#define SG_LIGHT_SLOPE_Q16 {rounded(2 * k1 * 65536 + 3 * k2 * 128)}\n"
+            f"#define SG_LIGHT_CUBIC {rounded(4 * 3 * k2 * 256)}\n\n"
+            "// Share of the sample capacitor in the capacitance at rest, Q0.16.\n"
+            f"#define SHARE_Q16 {rounded(SAMPLE_HOLD_PF / capacitance_at_rest_pf() * 65536)}\n\n"
+            f"// Weights of earlier unlit codes by period, every {PERIOD_STEP} cycles from {PERIOD_FROM} on: b and\n"
+            "// -c of sg_light.h, Q0.16.\n"
+            f"enum {{ PERIOD_FROM = {PERIOD_FROM}, PERIOD_BITS = {PERIOD_STEP.bit_length() - 1}, "
+            f"PERIOD_MOST = {PERIOD_FROM + PERIOD_STEP * (PERIOD_NODES - 1) - 1} }};\n"
+            f"static const uint16_t before_q16[{PERIOD_NODES}] SG_ROM = {{\n"
+            + rows([rounded(65536 * b) for b, _ in weights]) + "};\n"
+            f"static const uint16_t earlier_minus_q16[{PERIOD_NODES}] SG_ROM = {{\n"
+            + rows([rounded(-65536 * c) for _, c in weights]) + "};\n\n#endif\n")
+
+
+def log2_table():
+    """Text of sg_light_table.c."""
+    mantissa = [rounded(FEATURE_PER_OCTAVE * math.log2(1 + i / 64)) for i in range(65)]
+    return (LICENSE + MADE_BY + '#include "sg_light_loop.h"\n#include "sg_rom.h"\n\n'
+            "const uint16_t sg_light_log2_table[65] SG_ROM = {\n" + rows(mantissa) + "};\n")
 
 
 def crc32_table():
-    """Text of sg_crc32_table.h: CRC-32 (IEEE 802.3, reflected) of every byte."""
+    """Text of sg_crc32_table.h: CRC-32 (IEEE 802.3, reflected) of every half byte."""
     values = []
-    for byte in range(256):
-        crc = byte
-        for _ in range(8):
+    for nibble in range(16):
+        crc = nibble
+        for _ in range(4):
             crc = crc >> 1 ^ (0xEDB88320 if crc & 1 else 0)
         values.append(f"0x{crc:08X}")
     return (LICENSE + MADE_BY + "#ifndef SG_CRC32_TABLE_H\n#define SG_CRC32_TABLE_H\n\n"
             '#include <stdint.h>\n\n#include "sg_rom.h"\n\n'
-            "static const uint32_t crc32_table[256] SG_ROM = {\n" + rows(values, 8) + "};\n\n#endif\n")
+            "static const uint32_t crc32_table[16] SG_ROM = {\n" + rows(values, 8) + "};\n\n#endif\n")
 
 
 def main(argv):
     """Write or check; returns the exit code."""
     here = os.path.dirname(os.path.abspath(__file__))
     stale = []
-    tables = {"sg_gp_table.c": gp_table, "sg_mlp_table.c": mlp_table, "sg_expose_table.h": expose_table,
+    tables = {"sg_gp_table.c": gp_table, "sg_mlp_table.c": mlp_table, "sg_light_table.h": light_table,
+              "sg_light_table.c": log2_table,
               "sg_crc32_table.h": crc32_table}
     for name, make in tables.items():
         text = make()

@@ -45,22 +45,23 @@ struct sg_reading {
 struct sg_light_channel {
     int32_t sum_q5;                 // signal of the cycles added, 1/32 code at 0 V
     uint16_t exposure_cycles;       // that of everything here
-    uint16_t log2_exposure_q12;
+    int16_t unit_q12;               // feature of 1/32 code in this exposure
     uint16_t unlit_q5[2];           // of the previous cycle and of the one before it
     uint16_t mean_q5;               // of unlit codes
-    int8_t curve_q10;
+    int16_t slope_q16;              // 2 k1 and the channel's curve
     uint8_t settled;                // cycles with this exposure, up to 16
     uint8_t cycles;                 // added since the last features
     uint8_t flags;                  // bits of enum sg_light_flag: of the cycles added; after sg_light_features its own
+    uint8_t reserved;
 };
 
 struct sg_light {
     struct sg_light_channel channel[6];
-    int16_t before_q15;             // b of above
-    int16_t earlier_q15;            // c
-    uint16_t moving_q4;             // mean square of the unlit codes' common departure, 1/64 code^2
+    int16_t before_q16;             // b of above
+    int16_t earlier_q16;            // c
+    uint16_t moving;                // mean square of the sum of the unlit codes' departures, 1/64 code^2
     uint8_t wiring;                 // enum sg_wiring
-    uint8_t reserved;
+    uint8_t gap;                    // 1: the next cycle does not follow the previous one
 };
 
 // Begin, or begin anew after a change of timing or wiring: nothing is known, curves are 0.

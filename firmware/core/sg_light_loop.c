@@ -1,0 +1,193 @@
+// SPDX-License-Identifier: Apache-2.0
+// Codes and charges are counted in 1/32 (q5): 1023 codes are 32736, differences fit 16 bits signed and sums 16
+// bits unsigned.
+#include "sg_light_loop.h"
+
+#include "sg_light_table.h"
+#include "sg_rom.h"
+
+enum { LATE_UNKNOWN = 255 };
+
+// Upper half of a product.
+static inline int16_t high(int16_t x, int16_t y)
+{
+    return (int16_t)(((int32_t)x * y) >> 16);
+}
+
+static inline uint16_t size_of(int16_t x)
+{
+    return (uint16_t)(x < 0 ? -x : x);
+}
+
+// Charge between an unlit and a lit code, less their difference D. With X the mean of both over 1024 and d half
+// their difference:  D (2 k1 X + 3 k2 (X^2 + d^2 / 3) + curve X / 512).
+//   slope_q16   2 k1 + curve / 512
+// 65536 X is the sum of both codes. In the small term its upper byte does, which is half a step of 1/256 too small
+// on average: SG_LIGHT_SLOPE_Q16 makes that up. d^2: 3 k2 / 3 is 532/256 of the upper byte of (256 d)^2, taken as 2.
+// Overflow   the bracket is within -0.25 .. 0.36 in Q0.16.
+static int16_t bend_q5(uint16_t lit_q5, uint16_t unlit_q5, int16_t slope_q16)
+{
+    const int16_t difference = (int16_t)(lit_q5 - unlit_q5);
+    const uint16_t sum = (uint16_t)(lit_q5 + unlit_q5);
+    const uint8_t x = (uint8_t)(sum >> 8), d = (uint8_t)(size_of(difference) >> 8);
+    const int16_t slope = (int16_t)(slope_q16 + (int16_t)((uint16_t)(x * SG_LIGHT_CUBIC) >> 2));
+    const int16_t bracket = (int16_t)((int16_t)(((int32_t)slope * sum) >> 16) + (int16_t)(((uint16_t)(d * d) >> 8) << 1));
+    return high(difference, bracket);
+}
+
+void sg_light_settle(struct sg_light_channel *channel, uint16_t unlit_q5)
+{
+    channel->unlit_q5[0] = channel->unlit_q5[1] = channel->mean_q5 = unlit_q5;
+    channel->settled = 1;
+}
+
+// late / rest, Q0.16, rounded down; late < rest.
+static uint16_t ratio_q16(uint16_t late, uint16_t rest)
+{
+    uint16_t quotient = 0;
+    for (uint8_t bit = 0; bit < 16; bit++) {
+        late = (uint16_t)(late << 1);
+        quotient = (uint16_t)(quotient << 1);
+        if (late >= rest) {
+            late = (uint16_t)(late - rest);
+            quotient++;
+        }
+    }
+    return quotient;
+}
+
+// Charge that a late release missed: what was collected in the rest of the exposure goes on as it came.
+//   code read, before: that of the sample capacitor before it
+// More than half missed: 0, and STARVED.
+static int16_t missed_q5(struct sg_light_channel *channel, uint16_t code, uint16_t before, uint8_t late_cycles)
+{
+    if (late_cycles == LATE_UNKNOWN || late_cycles >= channel->exposure_cycles >> 1) {
+        channel->flags |= SG_LIGHT_STARVED;
+        return 0;
+    }
+    const uint16_t ratio = ratio_q16(late_cycles, (uint16_t)(channel->exposure_cycles - late_cycles));
+    const uint16_t code_q5 = sg_light_q5(code);
+    const int32_t came = (int32_t)code_q5 + bend_q5(code_q5, 0, channel->slope_q16)
+                       - high((int16_t)sg_light_q5(before), SHARE_Q16);
+    // less than 2^16; half of it at most is missed. A negative one is noise.
+    return came <= 0 ? 0 : (int16_t)(((uint32_t)came * ratio) >> 16);
+}
+
+// One unlit code into what is known of the ambient light. Returns the unlit code meant at the lit moment.
+static uint16_t ambient_q5(const struct sg_light *light, struct sg_light_channel *channel, uint16_t unlit_q5,
+                           struct sg_light_pass *pass)
+{
+    const int16_t off = (int16_t)(unlit_q5 - channel->mean_q5);
+    int16_t step = (int16_t)((off + 8) >> 4);
+    pass->departure = (int16_t)(pass->departure + step);
+    if (channel->settled < SG_LIGHT_SETTLED) {
+        uint8_t shift = 0;
+        for (uint8_t n = channel->settled; n > 1; n >>= 1)
+            shift++;
+        step = (int16_t)(((off >> shift) + 1) >> 1);
+        channel->settled++;
+    }
+    const uint16_t mean = (uint16_t)(channel->mean_q5 + step);
+    const uint16_t before = channel->unlit_q5[0], earlier = channel->unlit_q5[1];
+    channel->mean_q5 = mean;
+    channel->unlit_q5[1] = before;
+    channel->unlit_q5[0] = unlit_q5;
+    if (pass->moving_q8 == 0) {
+        if (size_of(off) < SG_LIGHT_STEP_Q5)
+            return mean;
+        sg_light_settle(channel, unlit_q5);
+        if (size_of(off) >= SG_LIGHT_LEAP_Q5)
+            channel->flags |= SG_LIGHT_STARVED;
+        return unlit_q5;
+    }
+    const int16_t past = (int16_t)(before - unlit_q5), long_past = (int16_t)(earlier - unlit_q5);
+    if (size_of(past) >= SG_LIGHT_LEAP_Q5) {    // no flicker falls or rises by all but a sixteenth in a cycle
+        const uint16_t most = past < 0 ? unlit_q5 : before;
+        if (size_of(past) - SG_LIGHT_LEAP_Q5 >= most - (most >> 4)) {
+            sg_light_settle(channel, unlit_q5);
+            channel->flags |= SG_LIGHT_STARVED;
+            return unlit_q5;
+        }
+    }
+    int32_t meant = (int32_t)unlit_q5 + high(past, light->before_q16) + high(long_past, light->earlier_q16);
+    if (pass->moving_q8 < SG_LIGHT_MOVING_FULL)
+        meant = mean + (((meant - mean) * pass->moving_q8) >> 8);
+    return meant < 0 ? 0 : meant > INT16_MAX ? INT16_MAX : (uint16_t)meant;
+}
+
+// A channel's first cycle, or its first with another exposure: what it has of this frame is dropped.
+static void begin(struct sg_light_channel *channel, uint16_t exposure_cycles, uint16_t unlit_q5)
+{
+    channel->exposure_cycles = exposure_cycles;
+    channel->unit_q12 = (int16_t)(UNIT_Q12 - sg_light_log2_q12(exposure_cycles == 0 ? 1 : exposure_cycles));
+    channel->sum_q5 = 0;
+    channel->cycles = 0;
+    sg_light_settle(channel, unlit_q5);
+}
+
+void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint8_t i, struct sg_light_pass *pass)
+{
+    struct sg_light_channel *channel = &light->channel[i];
+    const uint16_t lit = reading->lit_code[i], unlit = reading->unlit_code[i];
+    const uint16_t lit_q5 = sg_light_q5(lit);
+    uint16_t unlit_q5 = sg_light_q5(unlit);
+    if (channel->exposure_cycles != reading->exposure_cycles[i])
+        begin(channel, reading->exposure_cycles[i], unlit_q5);
+    if (channel->cycles == 0)
+        channel->flags = 0;
+    // Full itself, or nobody knows what the sample capacitor brought.
+    if (lit >= SG_LIGHT_SATURATED_CODE || unlit >= SG_LIGHT_SATURATED_CODE
+        || pass->lit_code >= SG_LIGHT_SATURATED_CODE || pass->unlit_code >= SG_LIGHT_SATURATED_CODE)
+        channel->flags |= SG_LIGHT_SATURATED;
+    const uint8_t late_lit = reading->late_lit_cycles[i], late_unlit = reading->late_unlit_cycles[i];
+    int16_t missed = 0;
+    if (late_lit)
+        missed = missed_q5(channel, lit, pass->lit_code, late_lit);
+    if (late_unlit) {
+        const int16_t more = missed_q5(channel, unlit, pass->unlit_code, late_unlit);
+        // From charge to code: over the curve's slope, 1 + 2 k1 x, of which `more` has the half.
+        unlit_q5 = (uint16_t)(unlit_q5 + more - high(more, high((int16_t)unlit_q5, TWICE_K1_Q16)));
+    }
+    const uint16_t meant_q5 = ambient_q5(light, channel, unlit_q5, pass);
+    const int16_t difference = (int16_t)(lit_q5 - meant_q5);
+    const int16_t bend = bend_q5(lit_q5, meant_q5, channel->slope_q16);
+    const int16_t brought = high(pass->brought_q5, SHARE_Q16);
+    if (channel->cycles != UINT8_MAX) {
+        channel->sum_q5 += (int32_t)difference + (int16_t)(bend + missed - brought);
+        channel->cycles++;
+    }
+    pass->brought_q5 = difference;
+    pass->lit_code = lit;
+    pass->unlit_code = unlit;
+}
+
+#ifndef SG_LIGHT_ASSEMBLY
+void sg_light_loop(struct sg_light *light, const struct sg_reading *reading, const uint8_t order[6],
+                   struct sg_light_pass *pass)
+{
+    for (uint8_t k = 0; k < SG_LIGHT_CHANNELS; k++) {
+        sg_light_one(light, reading, sg_rom_byte(order + k, SG_ROM_FLASH), pass);
+        if (k & 1U)
+            pass->brought_q5 = 0, pass->lit_code = pass->unlit_code = 0;
+    }
+}
+
+uint16_t sg_light_log2_q12(uint16_t x)
+{
+    uint8_t octave = 15;
+    if (!(x & 0xFF00U)) {
+        x = (uint16_t)(x << 8);
+        octave = 7;
+    }
+    while (!(x & 0x8000U)) {
+        x = (uint16_t)(x << 1);
+        octave--;
+    }
+    // 1.xxxxxx|yyyyyyyyy: six bits choose the entry, eight more interpolate. Neighbours differ by at most 92.
+    const uint16_t *entry = &sg_light_log2_table[(uint8_t)(x >> 9) & 63U];
+    const uint8_t fraction = (uint8_t)(x >> 1);
+    const uint16_t here = sg_rom_word(entry);
+    const uint8_t rise = (uint8_t)(sg_rom_word(entry + 1) - here);
+    return (uint16_t)(((uint16_t)octave << 12) + here + (uint8_t)((uint16_t)(rise * fraction + 128U) >> 8));
+}
+#endif
