@@ -4,14 +4,14 @@
     report = examine(load_headset("headsets/led2gaze.toml"))
     report.ok, report.irradiance_w_m2, report.margin
 
-Two hazards. Cornea and lens, 780..3000 nm: irradiance at the cornea. Retina, seen with no visible light beside
-it (a weak visual stimulus): radiance of what glows, weighted by R(wavelength), by the angle that it fills. Both
-are looked at averaged over the longest exposure and for a single pulse, at the real distances, in normal use, at
-the worst of every command and at the worst of every fault. The limits hold for any pupil.
+Two hazards. Cornea and lens, 780..3000 nm: irradiance at the cornea. Retina, seen with no visible light
+beside it (a weak visual stimulus): radiance of what glows, weighted by R(wavelength), by the angle that it
+fills. Both are looked at averaged over the longest exposure and for a single pulse, at the real distances,
+in normal use, at the worst of every command and at the worst of every fault. The limits hold for any pupil.
 
 A distance is from an emitter's lens to a point of the cornea, with the eye turned by up to GAZE_DEG and
-anywhere within SEAT_MM of its nominal place, per axis. Irradiance is what a meter reads that is turned to where
-it reads most.
+anywhere within SEAT_MM of its nominal place, per axis. Irradiance is what a meter reads that is turned to
+where it reads most.
 """
 
 import itertools
@@ -189,8 +189,8 @@ def irradiance(emitters, intensity_mw_sr, points_mm, on_axis):
 
 
 def currents_ma(headset, supply_v=SUPPLY_V):
-    """Current of each lit emitter, mA, [m], from its resistor; as stated where the file does not say how it is
-    wired.
+    """Current of each lit emitter, mA, [m], from its resistor; as stated where the file does not say how it
+    is wired.
     """
     kind, rail = headset.board.get("wiring"), headset.board.get("rail_volts", 0.0)
     across = max(supply_v - FORWARD_V - (rail if kind == "leds" else 0.0), 0.0)
@@ -305,8 +305,8 @@ def _radiance(port, milliwatts_sr, seconds, distance_mm, smallest):
 def _assumptions(headset):
     said = [
         "intensity_mw_sr is the most that any LED of the kind emits on its axis at current_ma",
-        "normal: nominal eye, beams as aimed, %.2f V; else: eye within %g mm of its place per axis, turned by up "
-        "to %g degrees, every beam's axis on the same point of the cornea, %.2f V at the board"
+        "normal: nominal eye, beams as aimed, %.2f V; else: eye within %g mm of its place per axis, turned by "
+        "up to %g degrees, every beam's axis on the same point of the cornea, %.2f V at the board"
         % (SUPPLY_V, SEAT_MM, GAZE_DEG, SUPPLY_MOST_V),
         "a fault lights every emitter until the watchdog (%d ms, %d %% slow) resets; then %d ms of dark"
         % (timing.WATCHDOG_MS, round(100 * timing.WATCHDOG_SPREAD), timing.LOCKOUT_MS),

@@ -5,9 +5,9 @@
         print(budget.setting, budget.total_mw)
 
 Counted is what the circuit needs: microcontroller, emitters by the time that they are lit, the rail's shunt
-regulator and the divider that watches the supply. What an Arduino Nano adds on its board (USB chip, power LED) is
-said apart. Beside it what the paper states: 800 mW for its LED headset at 250 Hz, and 16 mW, emitters and analog
-front end alone, for its photodiode headset.
+regulator and the divider that watches the supply. What an Arduino Nano adds on its board (USB chip, power
+LED) is said apart. Beside it what the paper states: 800 mW for its LED headset at 250 Hz, and 16 mW,
+emitters and analog front end alone, for its photodiode headset.
 """
 
 from dataclasses import asdict, dataclass
@@ -15,8 +15,8 @@ from dataclasses import asdict, dataclass
 from .eyesafety import SUPPLY_V, currents_ma
 from .timing import CPU_HZ, SLOT_CYCLES_MAX, Timing
 
-# ATmega328P at 16 MHz and 5 V, typical supply current: data sheet DS40002061, figures "Active Supply Current vs.
-# Frequency (1-20 MHz)" and "Idle Supply Current vs. Frequency (1-20 MHz)".
+# ATmega328P at 16 MHz and 5 V, typical supply current: data sheet DS40002061, figures "Active Supply
+# Current vs. Frequency (1-20 MHz)" and "Idle Supply Current vs. Frequency (1-20 MHz)".
 ACTIVE_MA, IDLE_MA = 9.2, 2.7
 CONVERTER_MA = 0.3  # ADC and its reference, the same data sheet
 RAIL_FEED_OHM = 330.0  # 5 V to the shunt regulator: what it takes to regulate with no emitter lit
@@ -71,7 +71,7 @@ def settings():
 
 
 def budget(headset, name, timing, sleeps):
-    """The Budget of a headset that senses as `timing`; sleeps: the microcontroller idles when it has no work."""
+    """The Budget of a headset that senses as `timing`; sleeps: the microcontroller idles without work."""
     duty, current = timing.emitter_duty(headset), currents_ma(headset)
     awake = min(AWAKE_CYCLES * timing.repeats / timing.frame_period_cycles, 1.0) if sleeps else 1.0
     mcu_ma = awake * ACTIVE_MA + (1 - awake) * IDLE_MA + CONVERTER_MA

@@ -2,9 +2,9 @@
 """When the firmware lights the emitters, in cycles of its clock: what eye safety and power are computed from.
 
 A sensing cycle has PHASES phases of SLOTS_A_PHASE conversions each, `slot_cycles` apart. In a phase two
-sensors are sampled lit, in slots 1 and 2, and unlit in slots 4 and 5. Lights go on a little before the earlier
-release and out after the second sample. The constants are those of firmware/ports/avr328p; a test compares
-them, and another one what the virtual Nano counts.
+sensors are sampled lit, in slots 1 and 2, and unlit in slots 4 and 5. Lights go on a little before the
+earlier release and out after the second sample. The constants are those of firmware/ports/avr328p; a test
+compares them, and another one what the virtual Nano counts.
 """
 
 from dataclasses import dataclass
@@ -81,8 +81,8 @@ class Timing:
 
 
 def lights(headset):
-    """bool [phase, emitter]: who is lit in each phase of the firmware. Of a headset without phases: everybody,
-    always, which is the most there can be.
+    """bool [phase, emitter]: who is lit in each phase of the firmware. Of a headset without phases:
+    everybody, always, which is the most there can be.
     """
     lit = np.ones((PHASES, len(headset.emitters)), bool)
     if headset.phases:

@@ -106,7 +106,8 @@ def test_the_doctors_figures_as_one_object(repo_root):
     assert code == 0 and data["ok"] is True and data["eye_safety"]["ok"] is True
     for case, least, most in (("normal", 5, 40), ("any command", 40, 95), ("any fault", 10, 60)):
         assert least < data["eye_safety"]["irradiance_w_m2"][case] < most
-    assert all(row["value"] * row["margin"] == pytest.approx(row["limit"]) for row in data["eye_safety"]["rows"])
+    rows = data["eye_safety"]["rows"]
+    assert all(row["value"] * row["margin"] == pytest.approx(row["limit"]) for row in rows)
     assert [one["setting"] for one in data["power"]][:2] == ["default", "250 Hz"]
     assert data["paper_mw"] == {"leds": 800, "photodiodes": 16}
 
