@@ -125,6 +125,7 @@ uint8_t app_probing(void);                                  // 1: the cycle just
 void app_rate_start(struct hal_timing *timing);
 void app_rate_renew(void);              // after a change of settings, model, streams or line
 int8_t app_settings(struct sg_settings *io);
+uint16_t app_frame_us(void);            // from frame to frame
 
 // app_models.c
 void app_models_start(void);                                // validate both slots, take the newest

@@ -15,36 +15,34 @@ enum app_rate_cost {
     COST_PACKET = 700,          // a stream's packet: encoding and the UART's interrupts, and per byte
     COST_BYTE = 105,
     COST_REQUEST = 500,         // what a request may take of a frame
-    COST_ROOMY = 8000,          // the costliest of them
-    BIT_CYCLES = 16,            // on the line at 1 Mbaud
+};
+
+// All of the following is in device microseconds, of 16 cycles, rounded so that nothing gets too short. A frame
+// lasts 62500 us at most: 16 bits hold everything.
+enum {
+    CYCLES_PER_US = SG_EXPOSE_CYCLES_PER_US,
+    PERIOD_LEAST_US = 999,      // 18 conversions as close as the converter can, 888 cycles,
+    PERIOD_MOST_US = 1998,      // and as far apart as the port's timer reaches
+    PAUSE_US = 20,              // dark for longer than this is a pause
+    ROOMY_US = 500,             // the costliest request
+    BYTE_US = 10,               // on the line at 1 Mbaud
     PACKET_BYTES = SG_WIRE_FRAME_MAX - SG_WIRE_BODY_MAX,
 };
 
-#define CYCLES_PER_S (1000000UL * SG_EXPOSE_CYCLES_PER_US)
-
-// Of one sensing cycle: its 18 conversions, each as soon as the converter can and as late as the timer reaches.
-enum { CONVERSIONS = 18, PERIOD_LEAST = CONVERSIONS * 888, PERIOD_MOST = CONVERSIONS * 1777 };
-
-// By subtraction: this chip does not divide, and nobody waits.
-SELDOM static uint32_t divided(uint32_t n, uint32_t by)
+// 10^6 / n, by subtraction: this chip does not divide, and nobody waits. n at least 16.
+SELDOM static uint16_t million_over(uint16_t n)
 {
-    uint32_t quotient = 0, rest = 0;
-    for (uint8_t i = 0; i < 32; i++) {
-        rest = (rest << 1) | (n >> 31);
-        n <<= 1;
+    uint32_t rest = 1000000UL;
+    uint16_t quotient = 0;
+    for (uint8_t bit = 16; bit-- != 0;) {
+        const uint32_t part = (uint32_t)n << bit;
         quotient <<= 1;
-        if (rest >= by) {
-            rest -= by;
+        if (rest >= part) {
+            rest -= part;
             quotient |= 1;
         }
     }
     return quotient;
-}
-
-// Down to a multiple of 18; exact below 32768.
-SELDOM static uint16_t whole_slots(uint16_t cycles)
-{
-    return (uint16_t)(((uint32_t)cycles * 3641U) >> 16) * CONVERSIONS;
 }
 
 SELDOM static uint8_t stream_bytes(void)
@@ -59,21 +57,21 @@ SELDOM static uint8_t stream_bytes(void)
     return n;
 }
 
-SELDOM static uint16_t infer_cycles(void)
+SELDOM static uint16_t infer_us(void)
 {
     const struct sg_model_view *model = app_model();
-    return model ? COST_MODEL + (uint16_t)COST_VECTOR * model->vectors : 0;
+    return model ? ((uint16_t)COST_MODEL + (uint16_t)COST_VECTOR * model->vectors) / CYCLES_PER_US + 1 : 0;
 }
 
-// Cycles between the last readings of a frame and the end of all work that this brings, interrupts included.
-SELDOM static uint32_t work_cycles(void)
+// Between the last readings of a frame and the end of all work that this brings, interrupts included.
+SELDOM static uint16_t work_us(void)
 {
-    uint32_t cycles = (uint32_t)(COST_SENSE + COST_CYCLE + COST_FRAME + COST_REQUEST) + infer_cycles();
+    uint16_t cycles = COST_SENSE + COST_CYCLE + COST_FRAME + COST_REQUEST + stream_bytes() * COST_BYTE;
     for (uint8_t bit = SG_STREAM_RAW; bit <= SG_STREAM_COUNTS; bit <<= 1) {
         if (app.stream & bit)
             cycles += COST_PACKET;
     }
-    return cycles + (uint16_t)stream_bytes() * (uint16_t)COST_BYTE;
+    return cycles / CYCLES_PER_US + 1 + infer_us();
 }
 
 SELDOM static uint8_t repeats_shift(void)
@@ -84,54 +82,52 @@ SELDOM static uint8_t repeats_shift(void)
     return shift;
 }
 
-// Frame after frame at least this far apart, cycles; *period is then one sensing cycle.
-SELDOM static uint32_t shortest(uint16_t *period)
+// Frame after frame at least this far apart; *period_us is then one sensing cycle.
+SELDOM static uint16_t shortest(uint16_t *period_us)
 {
-    const uint8_t shift = repeats_shift();
-    const uint32_t work = work_cycles();
-    // A cycle must last as long as the work of the frame before; what is above its longest is a gap.
-    uint32_t last = work < PERIOD_LEAST ? PERIOD_LEAST : work;
-    *period = PERIOD_LEAST;
-    if (app_live.power == SG_POWER_NORMAL && shift)
-        *period = last > PERIOD_MOST ? PERIOD_MOST : whole_slots((uint16_t)last + CONVERSIONS - 1);
-    if (last < *period)
-        last = *period;
-    uint32_t frame = ((uint32_t)*period << shift) - *period + last;
+    uint16_t period = PERIOD_LEAST_US, last = work_us();
+    if (last < period)
+        last = period;
+    // Cycles as long as the work of the frame before; what is above the longest is a gap.
+    if (app_live.power == SG_POWER_NORMAL)
+        period = last < PERIOD_MOST_US ? last : PERIOD_MOST_US;
+    *period_us = period;
+    const uint16_t frame = (uint16_t)(period << repeats_shift()) - period + last;
     // The line needs its time as well, and answers an eighth of it.
-    const uint32_t line = (uint32_t)stream_bytes() * (app.slow_line ? 2 * 10 * BIT_CYCLES : 10 * BIT_CYCLES);
-    if (frame < line + (line >> 3))
-        frame = line + (line >> 3);
-    return frame;
+    const uint16_t line = (uint16_t)(stream_bytes() * BYTE_US) << (app.slow_line ? 1 : 0);
+    return frame < line + (line >> 3) ? line + (line >> 3) : frame;
 }
 
 // The timing wanted.
 SELDOM void app_rate_start(struct hal_timing *timing)
 {
     const uint8_t shift = repeats_shift();
-    memset(timing, 0, sizeof *timing);
-    uint32_t frame = shortest(&timing->period_cycles);
+    uint16_t period, frame = shortest(&period);
     if (app_live.rate_hz) {
-        const uint32_t wanted = divided(CYCLES_PER_S, app_live.rate_hz);
+        const uint16_t wanted = million_over(app_live.rate_hz);
         if (frame < wanted)
             frame = wanted;
     }
     // Longer exposures instead of darkness.
     if (app_live.power == SG_POWER_NORMAL) {
-        const uint32_t each = frame >> shift;
-        timing->period_cycles = each > PERIOD_MOST ? PERIOD_MOST : whole_slots((uint16_t)each);
+        period = frame >> shift;
+        if (period > PERIOD_MOST_US)
+            period = PERIOD_MOST_US;
     }
-    timing->frame_cycles = frame;
+    memset(timing, 0, sizeof *timing);
+    timing->period_cycles = period * CYCLES_PER_US;
+    timing->frame_cycles = (uint32_t)frame * CYCLES_PER_US;
     timing->repeats = app_live.repeats;
     timing->wiring = app_live.wiring;
     timing->lights = app_live.lights;
     timing->probe = app.probe;
     timing->sleep = app_live.power == SG_POWER_LOW;
     // What is left of the time until the next frame's first cycle is complete.
-    const uint32_t dark = frame - ((uint32_t)timing->period_cycles << shift);
-    const uint32_t spare = dark + timing->period_cycles - work_cycles();
-    app.pause = dark > PERIOD_LEAST / 64;
-    app.infer_fits = !app.sensed || spare >= infer_cycles();
-    app.roomy = !app.sensed || spare >= COST_ROOMY;
+    const uint16_t dark = frame - (uint16_t)(period << shift);
+    const uint16_t spare = dark + period - work_us();
+    app.pause = dark > PAUSE_US;
+    app.infer_fits = !app.sensed || spare >= infer_us();
+    app.roomy = !app.sensed || spare >= ROOMY_US;
 }
 
 SELDOM void app_rate_renew(void)
@@ -139,6 +135,14 @@ SELDOM void app_rate_renew(void)
     struct hal_timing timing;
     app_rate_start(&timing);
     app_sense_timing(&timing);
+}
+
+uint16_t app_frame_us(void)
+{
+    const struct hal_timing *timing = app_timing();
+    if (!timing->frame_cycles)
+        return (timing->period_cycles / CYCLES_PER_US) << repeats_shift();
+    return (uint16_t)(timing->frame_cycles / CYCLES_PER_US);
 }
 
 SELDOM int8_t app_settings(struct sg_settings *io)
@@ -159,15 +163,10 @@ SELDOM int8_t app_settings(struct sg_settings *io)
         app_live_changed();
         app_rate_renew();
     }
-    const struct hal_timing *timing = app_timing();
-    uint16_t period;
-    uint32_t frame = timing->frame_cycles;
-    if (!frame)
-        frame = (uint32_t)timing->period_cycles << repeats_shift();
-    io->rate_hz = (uint16_t)divided(CYCLES_PER_S, frame);
-    io->rate_limit_hz = (uint16_t)divided(CYCLES_PER_S, shortest(&period));
-    io->period_us = timing->period_cycles / SG_EXPOSE_CYCLES_PER_US;
-    io->frame_period_us = (uint16_t)(frame / SG_EXPOSE_CYCLES_PER_US);
+    io->frame_period_us = app_frame_us();
+    io->rate_hz = million_over(io->frame_period_us);
+    io->rate_limit_hz = million_over(shortest(&io->period_us));
+    io->period_us = app_timing()->period_cycles / CYCLES_PER_US;
     io->repeats = app_live.repeats;
     io->wiring = app_live.wiring;
     io->power = app_live.power;

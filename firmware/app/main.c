@@ -245,6 +245,7 @@ SELDOM void app_describe(struct sg_hello *hello)
     hello->model_version = SG_MODEL_VERSION;
     hello->trial_bytes = HAL_TRIAL_BYTES;
     hello->channels = HAL_CHANNELS;
+    hello->frame_period_us = app_frame_us();
 }
 
 SELDOM static void start(void)

@@ -11,9 +11,14 @@
 #define GUARD(field) (offsetof(struct sg_model_guard, field))
 #define CRC_FROM 8U              // the CRC covers what follows it
 
+// What runs when a model is checked and never for a frame: compiled for size.
+#define SELDOM __attribute__((noinline, cold))
+
 static uint32_t crc32_byte(uint32_t crc, uint8_t byte)
 {
-    return (crc >> 8) ^ sg_rom_dword(&crc32_table[(uint8_t)crc ^ byte]);
+    crc ^= byte;
+    crc = (crc >> 4) ^ sg_rom_dword(&crc32_table[crc & 15U]);
+    return (crc >> 4) ^ sg_rom_dword(&crc32_table[crc & 15U]);
 }
 
 uint32_t sg_model_crc32_at(uint32_t crc, const uint8_t *data, uint16_t n, uint8_t space)
@@ -24,7 +29,7 @@ uint32_t sg_model_crc32_at(uint32_t crc, const uint8_t *data, uint16_t n, uint8_
     return ~crc;
 }
 
-uint32_t sg_model_crc32(uint32_t crc, const uint8_t *data, size_t n)
+SELDOM uint32_t sg_model_crc32(uint32_t crc, const uint8_t *data, size_t n)
 {
     crc = ~crc;
     for (size_t i = 0; i < n; i++)
@@ -33,7 +38,7 @@ uint32_t sg_model_crc32(uint32_t crc, const uint8_t *data, size_t n)
 }
 
 // Bytes of the grid, or SG_E_BOUNDS.
-static int grid_bytes(const uint8_t *image, uint8_t space)
+SELDOM static int grid_bytes(const uint8_t *image, uint8_t space)
 {
     const uint8_t wide = sg_rom_byte(image + TRUST(nodes), space);
     const uint8_t high = sg_rom_byte(image + TRUST(nodes) + 1, space);
@@ -42,7 +47,7 @@ static int grid_bytes(const uint8_t *image, uint8_t space)
     return (int)((uint16_t)((uint16_t)wide * high) * SG_MODEL_NODE_BYTES);
 }
 
-int sg_model_length(const uint8_t *image, uint32_t room, uint8_t space)
+SELDOM int sg_model_length(const uint8_t *image, uint32_t room, uint8_t space)
 {
     if (room < SG_MODEL_HEAD_BYTES)
         return SG_E_SHORT;
@@ -65,7 +70,7 @@ int sg_model_length(const uint8_t *image, uint32_t room, uint8_t space)
 }
 
 // Or of n bytes: 0 if all are.
-static uint8_t any_bit(const uint8_t *data, uint8_t n, uint8_t space)
+SELDOM static uint8_t any_bit(const uint8_t *data, uint8_t n, uint8_t space)
 {
     uint8_t bits = 0;
     for (uint8_t i = 0; i < n; i++)
@@ -74,7 +79,7 @@ static uint8_t any_bit(const uint8_t *data, uint8_t n, uint8_t space)
 }
 
 // Fields of channels >= d that are not 0.
-static uint8_t unused_channel_bits(const uint8_t *image, uint8_t channels, uint8_t space)
+SELDOM static uint8_t unused_channel_bits(const uint8_t *image, uint8_t channels, uint8_t space)
 {
     const uint8_t unused = (uint8_t)(2U * (SG_MODEL_CHANNELS - channels));
     const uint8_t *first = image + 2U * channels;
@@ -83,13 +88,13 @@ static uint8_t unused_channel_bits(const uint8_t *image, uint8_t channels, uint8
 }
 
 // Two's complement of 16 bits between two limits.
-static uint8_t within(uint16_t value, int16_t low, int16_t high)
+SELDOM static uint8_t within(uint16_t value, int16_t low, int16_t high)
 {
     return sg_q_signed16(value) >= low && sg_q_signed16(value) <= high;
 }
 
 // A channel without gain has no offset either.
-static uint8_t idle_offset(const uint8_t *image, uint8_t space)
+SELDOM static uint8_t idle_offset(const uint8_t *image, uint8_t space)
 {
     uint8_t idle = 0;
     for (uint8_t j = 0; j < 2U * SG_MODEL_CHANNELS; j += 2)
@@ -97,7 +102,7 @@ static uint8_t idle_offset(const uint8_t *image, uint8_t space)
     return idle;
 }
 
-static int check_guards(const uint8_t *image, uint8_t guards, uint8_t channels, uint8_t space)
+SELDOM static int check_guards(const uint8_t *image, uint8_t guards, uint8_t channels, uint8_t space)
 {
     const uint8_t *guard = image + TRUST(guard);
     for (uint8_t i = 0; i < guards; i++, guard += sizeof(struct sg_model_guard)) {
@@ -121,7 +126,7 @@ static int check_guards(const uint8_t *image, uint8_t guards, uint8_t channels, 
     return any_bit(guard, unused, space) ? SG_E_BOUNDS : SG_OK;
 }
 
-static int check_grid(const uint8_t *image, uint16_t bytes, uint8_t guards, uint8_t space)
+SELDOM static int check_grid(const uint8_t *image, uint8_t space)
 {
     for (uint8_t i = 0; i < 2; i++) {
         if (!within(sg_rom_u16(image + TRUST(origin_deg_q7) + 2U * i, space), -16384, 16384))
@@ -129,32 +134,44 @@ static int check_grid(const uint8_t *image, uint16_t bytes, uint8_t guards, uint
         if (!sg_rom_byte(image + TRUST(scale) + i, space))
             return SG_E_BOUNDS;
     }
-    const uint8_t *node = image + SG_MODEL_HEAD_BYTES;
-    for (; bytes != 0; bytes -= SG_MODEL_NODE_BYTES, node += SG_MODEL_NODE_BYTES) {
-        if (any_bit(node + guards, (uint8_t)(SG_MODEL_GUARDS - guards), space))
-            return SG_E_BOUNDS;
-    }
     return SG_OK;
 }
 
-static int check_records(const uint8_t *record, uint8_t vectors, uint8_t channels, uint8_t space)
+SELDOM static int check_record(const uint8_t *record, uint8_t channels, uint8_t space)
 {
-    for (; vectors != 0; vectors--, record += SG_MODEL_RECORD_BYTES) {
-        uint32_t c2 = 31;       // rounds 8 * sum c^2 / 256 up
-        for (uint8_t j = 0; j < SG_MODEL_CHANNELS; j++) {
-            const uint8_t c = sg_rom_byte(record + 2 + j, space);
-            if (c && j >= channels)
-                return SG_E_BOUNDS;
-            c2 += (uint16_t)((uint16_t)c * c);
-        }
-        if (sg_rom_u16(record, space) != (uint16_t)(c2 >> 5))
+    uint32_t c2 = 31;       // rounds 8 * sum c^2 / 256 up
+    for (uint8_t j = 0; j < SG_MODEL_CHANNELS; j++) {
+        const uint8_t c = sg_rom_byte(record + 2 + j, space);
+        if (c && j >= channels)
             return SG_E_BOUNDS;
+        c2 += (uint16_t)((uint16_t)c * c);
     }
-    return SG_OK;
+    return sg_rom_u16(record, space) == (uint16_t)(c2 >> 5) ? SG_OK : SG_E_BOUNDS;
 }
 
-int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space,
-                          uint32_t crc)
+SELDOM uint16_t sg_model_part(const uint8_t *image, uint16_t at, uint8_t space)
+{
+    const uint16_t records = (uint16_t)(SG_MODEL_HEAD_BYTES + (uint16_t)grid_bytes(image, space));
+    if (at < SG_MODEL_HEAD_BYTES)
+        return SG_MODEL_HEAD_BYTES;
+    return (uint16_t)(at + (at < records ? SG_MODEL_NODE_BYTES : SG_MODEL_RECORD_BYTES));
+}
+
+SELDOM int sg_model_check_part(const uint8_t *image, uint16_t at, uint8_t space)
+{
+    const uint16_t records = (uint16_t)(SG_MODEL_HEAD_BYTES + (uint16_t)grid_bytes(image, space));
+    const uint8_t *part = image + at;
+    if (at < records) {
+        const uint8_t guards = sg_rom_byte(image + TRUST(guards), space);
+        if (guards > SG_MODEL_GUARDS || any_bit(part + guards, (uint8_t)(SG_MODEL_GUARDS - guards), space))
+            return SG_E_BOUNDS;
+        return SG_OK;
+    }
+    return check_record(part, sg_rom_byte(image + HEAD(channels), space), space);
+}
+
+SELDOM int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space,
+                          uint32_t crc, int parts)
 {
     const int length = sg_model_length(image, room, space);
     if (length < 0)
@@ -183,13 +200,9 @@ int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint
         return SG_E_BOUNDS;
     if (unused_channel_bits(image, channels, space) || idle_offset(image, space))
         return SG_E_BOUNDS;
-    int verdict = check_guards(image, guards, channels, space);
-    if (verdict == SG_OK)
-        verdict = check_grid(image, grid, guards, space);
-    if (verdict == SG_OK)
-        verdict = check_records(image + records, vectors, channels, space);
-    if (verdict != SG_OK)
-        return verdict;
+    if (check_guards(image, guards, channels, space) != SG_OK || check_grid(image, space) != SG_OK
+        || parts != SG_OK)
+        return SG_E_BOUNDS;
 
     view->image = image;
     view->crc = crc;
@@ -203,11 +216,15 @@ int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint
     return SG_OK;
 }
 
-int sg_model_open(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space)
+SELDOM int sg_model_open(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space)
 {
     const int length = sg_model_length(image, room, space);
     if (length < 0)
         return length;
     const uint32_t crc = sg_model_crc32_at(0, image + CRC_FROM, (uint16_t)(length - (int)CRC_FROM), space);
-    return sg_model_open_checked(view, image, room, space, crc);
+    int parts = SG_OK;
+    for (uint16_t at = SG_MODEL_HEAD_BYTES; at < (uint16_t)length && parts == SG_OK;
+         at = sg_model_part(image, at, space))
+        parts = sg_model_check_part(image, at, space);
+    return sg_model_open_checked(view, image, room, space, crc, parts);
 }

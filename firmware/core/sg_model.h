@@ -134,10 +134,16 @@ uint32_t sg_model_crc32_at(uint32_t crc, const uint8_t *data, uint16_t n, uint8_
 // Returns   SG_OK or one of the errors above.
 int sg_model_open(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space);
 
-// The same, judged without the CRC pass, for a caller that has just computed it (crc over bytes [8, length))
-// in pieces.
+// The same for a caller that has gone over the image in pieces: crc is that of bytes [8, length), `parts` the first
+// error of sg_model_check_part, or SG_OK.
 int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space,
-                          uint32_t crc);
+                          uint32_t crc, int parts);
+
+// The nodes and records of an image one by one, from byte SG_MODEL_HEAD_BYTES to its length, which
+// sg_model_length has told: where the part after the one that begins at `at` begins (for an `at` inside of the
+// two pages, the first), and whether the one at `at` is good: SG_OK or SG_E_BOUNDS.
+uint16_t sg_model_part(const uint8_t *image, uint16_t at, uint8_t space);
+int sg_model_check_part(const uint8_t *image, uint16_t at, uint8_t space);
 
 // The length an image claims, for a caller that computes the CRC in pieces: header checks up to SG_E_SHORT as
 // above.

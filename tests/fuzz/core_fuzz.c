@@ -7,7 +7,8 @@
 //
 // Invariants: decode never returns more than 64 nor writes beyond; what decodes re-encodes to the same bytes;
 // a receiver is back in step one delimiter after anything; whatever sg_model_open accepts can be predicted
-// from, with any feature; nothing is written to a view that was refused.
+// from, with any feature; nothing is written to a view that was refused; no reading takes an exposure beyond its
+// limits.
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -15,6 +16,8 @@
 #include "sg_err.h"
 #include "sg_expose.h"
 #include "sg_gp.h"
+#include "sg_health.h"
+#include "sg_light.h"
 #include "sg_link.h"
 #include "sg_model.h"
 #include "sg_track.h"
@@ -253,17 +256,61 @@ static void fuzz_model(void)
     free(image);
 }
 
-static void fuzz_expose(void)
+static void any_exposures(uint16_t cycles[SG_LIGHT_CHANNELS])
 {
-    struct sg_expose_led led;
-    sg_expose_start(&led, (uint16_t)draw(65536));
-    for (int i = 0; i < 50; i++) {
-        uint16_t feature;
-        const uint16_t code = (uint16_t)draw(draw(2) ? 4096 : 65536), cycles = (uint16_t)draw(65536);
-        sg_expose_feature(code, cycles, &feature);
-        sg_expose_step(&led, code, draw(2) ? led.exposure_cycles : cycles);
-        HOLDS(led.exposure_cycles >= SG_EXPOSE_MIN_CYCLES && led.exposure_cycles <= SG_EXPOSE_MAX_CYCLES,
-              "limits");
+    for (int i = 0; i < SG_LIGHT_CHANNELS; i++)
+        cycles[i] = (uint16_t)(draw(4) ? 64 + draw(5200) : draw(65536));
+}
+
+// Readings that no port would give, in any order with everything that may come between them.
+static void fuzz_sense(void)
+{
+    struct sg_light light;
+    struct sg_expose expose;
+    struct sg_health health;
+    uint16_t cycles[SG_LIGHT_CHANNELS], most[SG_LIGHT_CHANNELS], feature[SG_LIGHT_CHANNELS];
+    any_exposures(cycles);
+    any_exposures(most);
+    sg_light_start(&light, (uint8_t)draw(2), (uint16_t)draw(65536));
+    sg_expose_start(&expose, cycles, most);
+    sg_health_start(&health);
+    for (int i = 0; i < 200; i++) {
+        struct sg_reading reading;
+        const uint32_t most_code = draw(2) ? 1024 : 65536;
+        for (int j = 0; j < SG_LIGHT_CHANNELS; j++) {
+            reading.lit_code[j] = (uint16_t)draw(most_code);
+            reading.unlit_code[j] = (uint16_t)(draw(2) ? reading.lit_code[j] : draw(most_code));
+            reading.exposure_cycles[j] = draw(4) ? expose.led[j].exposure_cycles : (uint16_t)draw(65536);
+            reading.late_lit_cycles[j] = (uint8_t)(draw(4) ? 0 : draw(256));
+            reading.late_unlit_cycles[j] = (uint8_t)(draw(4) ? 0 : draw(256));
+        }
+        reading.held_code = (uint16_t)(draw(4) ? 0 : draw(most_code));
+        sg_light_add(&light, &reading);
+        if (draw(16) == 0) {
+            int8_t curve[SG_LIGHT_CHANNELS];
+            for (int j = 0; j < SG_LIGHT_CHANNELS; j++)
+                curve[j] = (int8_t)(draw(256) - 128);
+            sg_light_curve(&light, curve);
+        }
+        if (draw(16) == 0)
+            sg_light_gap(&light);
+        if (draw(4) != 0 || i % SG_LIGHT_REPEATS_MAX == SG_LIGHT_REPEATS_MAX - 1) {
+            const uint8_t flags = sg_light_features(&light, feature);
+            HOLDS((flags & ~(SG_LIGHT_SATURATED | SG_LIGHT_STARVED)) == 0, "flags of the features");
+            struct sg_health_sight sight = { .lit_code = reading.lit_code[i % 6], .feature = feature[i % 6],
+                                             .unlit_code = reading.unlit_code[i % 6],
+                                             .before_code = (uint16_t)draw(1024),
+                                             .exposure_cycles = reading.exposure_cycles[i % 6],
+                                             .most_cycles = most[i % 6], .offset = (uint16_t)draw(65536),
+                                             .gain_q12 = (uint16_t)draw(65536) };
+            sg_health_look(&health, (uint8_t)(i % 6), &sight);
+            HOLDS(health.fault[i % 6] < 16, "faults have names");
+        }
+        sg_expose_cycle(&expose, reading.lit_code, reading.unlit_code, reading.exposure_cycles);
+        for (int j = 0; j < SG_LIGHT_CHANNELS; j++) {
+            const uint16_t now = expose.led[j].exposure_cycles;
+            HOLDS(now >= SG_EXPOSE_MIN_CYCLES && now <= SG_EXPOSE_MAX_CYCLES, "limits of an exposure");
+        }
     }
 }
 
@@ -278,7 +325,7 @@ int main(int argc, char **argv)
         fuzz_link();
         fuzz_model();
         if (i % 16 == 0)
-            fuzz_expose();
+            fuzz_sense();
     }
     printf("decoded %lu opened %lu short %lu magic %lu version %lu bounds %lu crc %lu\n", decoded, opened,
            refused[-SG_E_SHORT], refused[-SG_E_MAGIC], refused[-SG_E_VERSION], refused[-SG_E_BOUNDS],

@@ -14,12 +14,14 @@ SHORTEST = {                        # request: bytes of its struct
     lib.SG_MSG_HELLO: 0, lib.SG_MSG_STATUS: 0, lib.SG_MSG_MODEL_INFO: 0,
     lib.SG_MSG_PING: 4, lib.SG_MSG_MODE: 1, lib.SG_MSG_TRIAL_USE: 1, lib.SG_MSG_REBOOT: 1, lib.SG_MSG_BAUD: 1,
     lib.SG_MSG_INFER: 12, lib.SG_MSG_MODEL_READ: 4, lib.SG_MSG_MODEL_VERIFY: 4, lib.SG_MSG_TRIAL_WRITE: 4,
-    lib.SG_MSG_EXPOSURE: 14, lib.SG_MSG_RECENTRE: 10,
+    lib.SG_MSG_EXPOSURE: 14, lib.SG_MSG_RECENTRE: 10, lib.SG_MSG_SETTINGS: 14, lib.SG_MSG_CURVE: 8,
+    lib.SG_MSG_PROBE: 1,
 }
 HARMLESS = {                        # bodies that change nothing but are legal
     lib.SG_MSG_PING: b"abcd", lib.SG_MSG_MODE: b"\0", lib.SG_MSG_TRIAL_USE: b"\0", lib.SG_MSG_BAUD: b"\0",
     lib.SG_MSG_INFER: bytes(12), lib.SG_MSG_MODEL_READ: b"\0\0\0\1", lib.SG_MSG_MODEL_VERIFY: bytes(4),
     lib.SG_MSG_TRIAL_WRITE: b"\0\0\2\1x", lib.SG_MSG_EXPOSURE: bytes(14), lib.SG_MSG_RECENTRE: bytes(10),
+    lib.SG_MSG_SETTINGS: bytes(14), lib.SG_MSG_CURVE: bytes(8), lib.SG_MSG_PROBE: b"\0",
 }
 
 
@@ -33,9 +35,9 @@ def test_hello_says_what_the_board_is(board):
     assert (hello.wire_version, hello.model_version) == (lib.SG_WIRE_VERSION, lib.SG_MODEL_VERSION)
     assert hello.board == lib.SG_BOARD_NANO328P and hello.channels == 6 and hello.cpu_hz == 16_000_000
     assert hello.slot_base == (0x6000, 0x6C00) and hello.slot_bytes == lib.SG_MODEL_SLOT_BYTES
-    assert hello.page_bytes == 128 and hello.frame_period_us == 3840
-    assert hello.trial_bytes == 880
-    assert 0 < hello.exposure_min_us < hello.exposure_max_us <= 304
+    assert hello.page_bytes == 128 and hello.frame_period_us == 999
+    assert hello.trial_bytes == 640
+    assert 0 < hello.exposure_min_us < hello.exposure_max_us <= 326
 
 
 def test_ping_stamps_arrival_before_answer_in_device_time(board):
@@ -83,8 +85,11 @@ def test_longer_body_is_accepted_and_its_excess_ignored(board, kind):
     (lib.SG_MSG_REBOOT, b"\xa4", lib.SG_E_ARG),
     (lib.SG_MSG_BAUD, b"\x02", lib.SG_E_ARG),
     (lib.SG_MSG_TRIAL_USE, b"\x02", lib.SG_E_ARG),
-    (lib.SG_MSG_EXPOSURE, bytes(12) + b"\x04\0", lib.SG_E_ARG),
+    (lib.SG_MSG_EXPOSURE, bytes(12) + b"\x05\0", lib.SG_E_ARG),
     (lib.SG_MSG_RECENTRE, bytes(8) + b"\x03\0", lib.SG_E_ARG),
+    (lib.SG_MSG_CURVE, bytes(6) + b"\x02\0", lib.SG_E_ARG),
+    (lib.SG_MSG_SETTINGS, bytes(8) + b"\x02" + bytes(5), lib.SG_E_ARG),
+    (lib.SG_MSG_PROBE, b"\x06", lib.SG_E_ARG),
     (lib.SG_MSG_RECENTRE, bytes(8) + b"\x01\0", lib.SG_E_STATE),
     (lib.SG_MSG_MODEL_VERIFY, b"\0\0\x03\0", lib.SG_E_ARG),
     (lib.SG_MSG_MODEL_READ, b"\0\0\x03\1", lib.SG_E_ARG),
@@ -92,14 +97,14 @@ def test_longer_body_is_accepted_and_its_excess_ignored(board, kind):
     (lib.SG_MSG_MODEL_READ, b"\0\0\x00\x31", lib.SG_E_ARG),
     (lib.SG_MSG_MODEL_READ, b"\xd1\x0b\x00\x30", lib.SG_E_BOUNDS),      # 3025 + 48 > 3072
     (lib.SG_MSG_MODEL_READ, b"\xff\xff\x00\x01", lib.SG_E_BOUNDS),
-    (lib.SG_MSG_MODEL_READ, b"\x70\x03\x02\x01", lib.SG_E_BOUNDS),      # 880: one beyond the trial
-    (lib.SG_MSG_TRIAL_WRITE, b"\x70\x03\x02\x01x", lib.SG_E_BOUNDS),
+    (lib.SG_MSG_MODEL_READ, b"\x80\x02\x02\x01", lib.SG_E_BOUNDS),      # 640: one beyond the trial
+    (lib.SG_MSG_TRIAL_WRITE, b"\x80\x02\x02\x01x", lib.SG_E_BOUNDS),
     (lib.SG_MSG_TRIAL_WRITE, b"\xff\xff\x02\x01x", lib.SG_E_BOUNDS),
     (lib.SG_MSG_TRIAL_WRITE, b"\0\0\x00\x01x", lib.SG_E_ARG),           # flash is not written by requests
     (lib.SG_MSG_TRIAL_WRITE, b"\0\0\x02\x00", lib.SG_E_ARG),
     (lib.SG_MSG_TRIAL_WRITE, b"\0\0\x02\x31" + bytes(49), lib.SG_E_ARG),
     (lib.SG_MSG_TRIAL_WRITE, b"\0\0\x02\x02x", lib.SG_E_SHORT),         # announces more than it brings
-    (0x00, b"", lib.SG_E_UNKNOWN), (0x0F, b"", lib.SG_E_UNKNOWN), (0x40, bytes(28), lib.SG_E_UNKNOWN),
+    (0x00, b"", lib.SG_E_UNKNOWN), (0x12, b"", lib.SG_E_UNKNOWN), (0x40, bytes(28), lib.SG_E_UNKNOWN),
     (0x7F, bytes(2), lib.SG_E_UNKNOWN), (0x81, b"", lib.SG_E_UNKNOWN), (0xFF, b"", lib.SG_E_UNKNOWN),
 ])
 def test_bad_argument_is_refused_with_its_reason(board, kind, body, error):

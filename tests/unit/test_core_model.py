@@ -203,6 +203,6 @@ def test_a_crc_made_in_pieces_opens_the_same_and_a_wrong_one_does_not():
     crc = lib.sg_model_crc32_at(0, view.bytes + 8, 100, 0)
     crc = lib.sg_model_crc32_at(crc, view.bytes + 108, view.view.length - 108, 0)
     again = ffi.new("struct sg_model_view *")
-    assert lib.sg_model_open_checked(again, view.bytes, view.view.length, 0, crc) == lib.SG_OK
+    assert lib.sg_model_open_checked(again, view.bytes, view.view.length, 0, crc, 0) == lib.SG_OK
     assert bytes(ffi.buffer(again)) == bytes(ffi.buffer(view.view))
-    assert lib.sg_model_open_checked(again, view.bytes, view.view.length, 0, crc ^ 1) == lib.SG_E_CRC
+    assert lib.sg_model_open_checked(again, view.bytes, view.view.length, 0, crc ^ 1, 0) == lib.SG_E_CRC
