@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings: rate and its limit, repeats, power, lights, exposures' limits, curves, probes; what survives power."""
+
+import itertools
+
+import pytest
+
+from conftest import collect, costly_model, exchange, random_model
+from sparsegaze import wire
+from sparsegaze.errors import DeviceError
+from sparsegaze.wire import lib
+
+CPU_HZ = 16_000_000
+SETTINGS = dict(op=lib.SG_SETTINGS_SET, rate_hz=0, repeats=1, wiring=0, power=0, rolling=0, lights=1)
+STREAMS = [dict(zip(("raw", "gaze", "counts"), bits)) for bits in itertools.product((False, True), repeat=3)]
+
+
+def hertz_of(frames):
+    """Frames a second of device time."""
+    return 1e6 * (frames[-1].seq - frames[0].seq) / (frames[-1].t_us - frames[0].t_us)
+
+
+def calm(device):
+    """Nothing was late, and nothing was lost on the way out."""
+    status = device.status()
+    assert (status.late_frames, status.late_slots, status.tx_dropped, status.rx_overrun) == (0, 0, 0, 0)
+    return status
+
+
+def test_by_default_frames_come_as_fast_as_can_be(board):
+    _, device = board(models={0: random_model(20).image})
+    device.set_stream(gaze=True)
+    now = device.settings()
+    assert (now.rate_hz, now.rate_limit_hz, now.period_us, now.frame_period_us) == (1001, 1001, 999, 999)
+    assert (now.repeats, now.wiring, now.power, now.rolling, now.lights) == (1, 0, 0, 0, 1)
+    frames = collect(device, 300)
+    assert {b.t_us - a.t_us for a, b in zip(frames, frames[1:])} <= {998, 999, 1000}
+    calm(device)
+
+
+@pytest.mark.parametrize("rate_hz", [16, 60, 250, 500, 777, 1000])
+def test_the_rate_asked_for_is_the_rate_of_the_frames(board, rate_hz):
+    _, device = board(models={0: random_model(20).image})
+    now = device.settings(rate_hz=rate_hz)
+    assert now.rate_hz == rate_hz and now.rate_limit_hz == 1001
+    assert now.frame_period_us == pytest.approx(1e6 / rate_hz, abs=1)
+    assert 999 <= now.period_us <= 1999
+    device.set_stream(gaze=True)
+    frames = collect(device, max(20, rate_hz // 4))[10:]
+    assert hertz_of(frames) == pytest.approx(rate_hz, rel=2e-3)
+    assert [b.seq - a.seq for a, b in zip(frames, frames[1:])] == [1] * (len(frames) - 1)
+    assert device.hello.frame_period_us == 999 and calm(device).frames > 0
+
+
+@pytest.mark.parametrize("repeats", [2, 4, 8, 16])
+def test_a_frame_of_several_cycles_takes_as_long_as_they_do(board, repeats):
+    _, device = board(models={0: random_model(20).image})
+    now = device.settings(repeats=repeats)
+    assert now.rate_hz == now.rate_limit_hz == CPU_HZ // (repeats * 16 * now.period_us) or now.rate_hz
+    assert now.frame_period_us == pytest.approx(repeats * now.period_us, abs=repeats)
+    device.set_stream(raw=True, gaze=True)
+    frames = collect(device, 60)
+    assert hertz_of(frames) == pytest.approx(now.rate_hz, rel=0.01)
+    # From the mean of all samples to the last one: half a frame, about.
+    assert frames[-1].raw.span_us == pytest.approx(now.frame_period_us / 2, rel=0.2)
+    calm(device)
+
+
+def test_a_longer_period_is_exposed_longer_unless_power_is_low(board):
+    _, device = board()
+    normal = device.settings(rate_hz=250)
+    assert normal.period_us == 1999 and normal.frame_period_us == 4000
+    assert device.exposure(us=[1000] * 6).exposure_us[1] > 200
+    low = device.settings(power="low")
+    assert low.period_us == 999 and low.frame_period_us == 4000 and low.power == lib.SG_POWER_LOW
+    assert max(device.exposure().exposure_us) < 160
+    device.set_stream(raw=True)
+    assert hertz_of(collect(device, 50)) == pytest.approx(250, rel=2e-3)
+    calm(device)
+
+
+def test_low_power_sleeps_and_is_dark_between_frames(board):
+    nano, device = board()
+    device.exposure(us=[100] * 6)
+    spent = {}
+    for power in ("normal", "low"):
+        device.settings(rate_hz=100, power=power)
+        device.link.sleep(0.1)
+        nano.control.counters_clear()
+        device.link.sleep(1.0)
+        spent[power] = nano.control.counters()
+    assert spent["normal"]["asleep_cycles"] == 0 and spent["low"]["asleep_cycles"] > 0.7 * CPU_HZ
+    assert 0 < spent["low"]["lit_cycles_0"] <= 1.05 * spent["normal"]["lit_cycles_0"]
+
+
+@pytest.mark.parametrize("field, value", [
+    ("rate_hz", 1), ("rate_hz", 15), ("repeats", 0), ("repeats", 3), ("repeats", 17), ("repeats", 32),
+    ("wiring", 2), ("power", 2), ("rolling", 1), ("lights", 2), ("op", 2)])
+def test_settings_that_do_not_exist_are_refused_and_change_nothing(board, field, value):
+    _, device = board()
+    before = device.settings()
+    packets = exchange(device, wire.encode(lib.SG_MSG_SETTINGS, 4, wire.body("struct sg_settings",
+                                                                             **SETTINGS | {field: value})))
+    assert [(p.type, p.seq) for p in packets] == [(lib.SG_MSG_ERROR, 4)]
+    assert wire.parse_error(packets[0].body) == (lib.SG_E_ARG, lib.SG_MSG_SETTINGS)
+    assert device.settings() == before
+
+
+def test_a_rate_beyond_the_limit_is_the_limit(board):
+    _, device = board(models={0: random_model(216).image})
+    device.set_stream(gaze=True)
+    now = device.settings(rate_hz=1000)
+    assert 300 < now.rate_limit_hz < 450 and now.rate_hz == now.rate_limit_hz
+    assert now.period_us == pytest.approx(1999, abs=1)
+    assert hertz_of(collect(device, 100)) == pytest.approx(now.rate_hz, rel=0.01)
+    calm(device)
+
+
+def test_the_limit_follows_model_and_streams_and_the_wish_is_kept(board):
+    _, device = board(models={0: random_model(64).image})
+    device.settings(rate_hz=900)
+    limit = {}
+    for streams in ({}, {"gaze": True}, {"raw": True, "gaze": True}, {"raw": True, "gaze": True, "counts": True}):
+        device.set_stream(**streams)
+        now = device.settings()
+        limit[len(streams)] = now.rate_limit_hz
+        assert now.rate_hz == min(900, now.rate_limit_hz)
+    assert limit[0] > limit[1] > limit[2] > limit[3] > 300
+    device.trial(random_model(10, seed=3).image)
+    device.set_stream(gaze=True)
+    assert device.settings().rate_limit_hz == 1001 and device.settings().rate_hz == 900
+    device.trial(None)
+    assert device.settings().rate_hz == limit[1]
+    device.set_stream(raw=True, gaze=True, counts=True)
+    device.set_baud(500_000)
+    assert device.settings().rate_limit_hz < min(limit[3], 430)
+    collect(device, 200)
+    calm(device)
+
+
+@pytest.mark.parametrize("vectors", [0, 1, 30, 64, 216])
+def test_no_frame_is_late_with_any_model_streams_and_repeats(board, vectors):
+    """The estimate of the work of a frame is above what it takes, and not far above."""
+    models = {0: costly_model([42000] * 6, vectors).image} if vectors else None
+    nano, device = board(models=models)
+    for streams in STREAMS:
+        device.set_stream(**streams)
+        for repeats in (1, 4) if vectors in (0, 64) else (1,):
+            now = device.settings(rate_hz=0, repeats=repeats)
+            nano.control.markers_clear()
+            device.link.sleep(0.25)
+            busy = nano.control.markers()["5"].most
+            room = 16 * (now.frame_period_us - (repeats - 1) * now.period_us)
+            print(f"{vectors} vectors, {streams}, {repeats} repeats: {busy:.0f} of {room} cycles, "
+                  f"limit {now.rate_limit_hz} Hz")
+            assert busy <= room
+    calm(device)
+
+
+def test_settings_exposures_limits_and_curves_survive_a_power_cycle(board):
+    nano, device = board()
+    wanted = device.settings(rate_hz=123, repeats=2, power="low", lights=False)
+    curve = device.curve([0.01, -0.02, 0.03, 0.0, -0.125, 0.124]).curve_q10
+    assert curve == (10, -20, 31, 0, -128, 127)
+    device.settings(lights=True)
+    wanted = device.settings()
+    device.exposure(limit_us=[50, 40, 30, 20, 10, 60])
+    held = device.exposure(us=[11, 22, 33, 44, 55, 66])
+    device.link.sleep(3.0)
+    nano.control.power(False)
+    nano.control.power(True)
+    device.connect()
+    assert device.settings() == wanted and device.curve().curve_q10 == curve
+    now = device.exposure()
+    assert not now.automatic and now.exposure_us == pytest.approx(held.exposure_us, rel=0.05, abs=2.5)
+    device.exposure(auto=True)
+    device.link.sleep(1.0)
+    now = device.exposure()
+    assert now.automatic
+    assert all(us <= limit + 2.5 for us, limit in zip(now.exposure_us, (50, 40, 30, 20, 10, 60)))
+
+
+def test_lights_that_are_off_stay_off_through_a_power_cycle_and_every_frame_says_so(board):
+    nano, device = board(models={0: random_model(20).image})
+    device.settings(lights=False)
+    device.link.sleep(1.0)
+    nano.control.power(False)
+    nano.control.power(True)
+    device.connect()
+    nano.control.counters_clear()
+    device.set_stream(raw=True, gaze=True)
+    for frame in collect(device, 100):
+        assert frame.raw.flags & frame.gaze.flags & lib.SG_FLAG_FAULT and not frame.gaze.valid
+    assert device.status().alarms == ("lights-off",)
+    counters = nano.control.counters()
+    assert all(counters[f"lit_cycles_{i}"] == 0 for i in range(6))
+    device.settings(lights=True)
+    device.link.sleep(0.1)
+    assert device.status().alarms == ()
+    assert not any(frame.raw.flags & lib.SG_FLAG_FAULT for frame in collect(device, 100)[50:])
+    assert all(nano.control.counters()[f"lit_cycles_{i}"] for i in range(6))
+
+
+def test_a_probe_lights_one_emitter_alone_and_all_is_as_before_afterwards(board):
+    nano, device = board()
+    before = device.exposure(us=[100] * 6)
+    device.set_stream(raw=True)
+    seen = collect(device, 20)
+    partner = {0: 5, 5: 0, 1: 4, 4: 1, 2: 3, 3: 2}
+    for emitter in range(6):
+        nano.control.counters_clear()
+        found = device.probe(emitter)
+        counters = nano.control.counters()
+        lit = [counters[f"lit_cycles_{i}"] for i in range(6)]
+        assert max(lit) == lit[emitter] and found.emitter == emitter
+        # What lights does not sense meanwhile, nor does the one that shares its time.
+        assert found.feature[emitter] == found.feature[partner[emitter]] == 0
+        assert all(found.feature[i] > 0 for i in range(6) if i not in (emitter, partner[emitter]))
+    seen = [frame for frame in collect(device, 400)]
+    gaps = [b.seq - a.seq for a, b in zip(seen, seen[1:])]
+    assert gaps[-100:] == [1] * 100
+    assert device.exposure() == before and device.status().late_frames == 0
+
+
+def test_probes_are_refused_in_the_dark_and_one_at_a_time(board):
+    _, device = board()
+    packets = exchange(device, wire.encode(lib.SG_MSG_PROBE, 1, b"\1") + wire.encode(lib.SG_MSG_PROBE, 2, b"\2"))
+    assert sorted((p.seq, p.type) for p in packets) == [(1, lib.SG_MSG_PROBE | lib.SG_REPLY), (2, lib.SG_MSG_ERROR)]
+    assert wire.parse_error(packets[0].body) == (lib.SG_E_BUSY, lib.SG_MSG_PROBE)
+    device.settings(lights=False)
+    with pytest.raises(DeviceError) as caught:
+        device.probe(0)
+    assert caught.value.code == lib.SG_E_STATE
+
+
+def test_trying_many_exposures_does_not_wear_the_store(board):
+    _, device = board()
+    device.link.sleep(3.0)
+    written = device.status().eeprom_writes
+    for k in range(40):
+        device.exposure(us=[20 + k] * 6)
+        device.link.sleep(0.04)
+    assert device.status().eeprom_writes == written
+    device.link.sleep(4.0)
+    assert device.status().eeprom_writes == written + 1
