@@ -6,16 +6,18 @@ import os
 from dataclasses import dataclass
 from typing import Optional
 
-from . import capture, targets, validate
-from .errors import CalibrationError, SparsegazeError
+from . import capture, probe, targets, validate
+from .errors import CalibrationError, PortError, SparsegazeError
 
 RECORDING, MODEL, REPORT = "recording.csv", "model.sgm", "report.json"
+LOOK_S = 0.5  # to look back at the centre
 
 
 @dataclass
 class Calibration:
     """capture (capture.Capture), fit (distil.FitResult), upload (store.UploadReport or None), validation (or
-    None), folder (where recording, model and report are kept, or None).
+    None), folder (where recording, model and report are kept, or None), seen (who saw whom, float64 [6, 6] of
+    probe.measure, or None).
     """
 
     capture: capture.Capture
@@ -23,6 +25,7 @@ class Calibration:
     upload: Optional[object]
     validation: Optional[validate.Validation]
     folder: Optional[str]
+    seen: Optional[object] = None
 
     def report(self):
         """Everything as one dict of plain values."""
@@ -36,6 +39,7 @@ class Calibration:
             "fit": plain(self.fit.report),
             "crc_host": model.crc,
             "notes": list(self.capture.run.notes),
+            "probe": self.seen,
         }
         if self.upload is not None:
             # The upload gives the model its generation, which the checksum covers.
@@ -104,10 +108,11 @@ def run(
             taken = capture.run(device, shown, plan, path, meta, progress)
             try:
                 capture.check(taken)
+                seen = _who_sees_whom(device, shown)
                 fitted = fit_recording(taken.recording, n_vectors=vectors, progress=progress)
                 if folder:
                     fitted.model.save(os.path.join(folder, MODEL))
-                done = Calibration(taken, fitted, None, None, folder)
+                done = Calibration(taken, fitted, None, None, folder, seen)
                 if upload:
                     done.upload = store.upload(link, fitted.model, progress)
                     if folder:
@@ -128,6 +133,18 @@ def run(
         finally:
             if screen is None:
                 shown.close()
+
+
+def _who_sees_whom(device, shown):
+    """The probe that later ones are compared with, of an eye that looks ahead; None: this board has none."""
+    try:
+        shown.look((0.0, 0.0), device.status().t_us)
+        device.link.sleep(LOOK_S)
+        return probe.measure(device)
+    except PortError:
+        raise
+    except SparsegazeError:
+        return None
 
 
 def plain(value):

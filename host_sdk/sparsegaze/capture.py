@@ -8,7 +8,7 @@ import numpy as np
 
 from . import selection, session
 from .errors import CalibrationError, RecordingError
-from .recording import Recording, RecordingWriter
+from .recording import FORMAT, Recording, RecordingWriter
 
 LEAST_SHARE = 0.6  # of the targets that must have yielded usable frames
 
@@ -31,10 +31,12 @@ def run(device, screen, plan, path=None, meta=None, progress=None):
     Returns Capture. Raises what session.run raises, and RecordingError when the file cannot be written.
     """
     meta = {
+        "recording_format": FORMAT,
         "plan": plan.name,
         "targets": len(plan),
         "dwell_s": plan.dwell_s,
         "settle_s": plan.settle_s,
+        **_sensing(device),
         **(meta or {}),
     }
     if path is None:
@@ -70,8 +72,7 @@ def check(capture, remedy=""):
         return
     counts = chosen.counts()
     causes = {
-        "flagged": "readings were saturated, starved or at fault: keep sunlight away, the headset before the "
-        "eye; `sparsegaze status` names faults",
+        "flagged": "readings were saturated or starved: keep sunlight away, the headset before the eye",
         "blink": "the signals kept jumping: blink between targets, hold the headset still",
         "unstable": "the signals kept jumping: blink between targets, hold the headset still",
         "inattentive": "the eye was elsewhere: look at each dot until it moves",
@@ -82,6 +83,13 @@ def check(capture, remedy=""):
         f"only {chosen.used_targets} of {chosen.n_targets} targets gave usable data{kept}",
         remedy or f"{causes[worst]}; then calibrate again",
     )
+
+
+def _sensing(device):
+    """How the device senses, for the file's head."""
+    now = device.settings()
+    curve = " ".join(f"{value:.4f}" for value in device.curve().curve)
+    return {"repeats": now.repeats, "period_us": now.period_us, "wiring": now.wiring_text, "curve": curve}
 
 
 def _finish(whole, path, meta):
@@ -108,8 +116,8 @@ def _finish(whole, path, meta):
 def _select(part, provisional=False):
     from ._core import lib
 
-    spoilt = lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_FAULT
-    flagged = (part.frames["raw_flags"] & spoilt) != 0
+    # Not FAULT: the device compares with the calibration that it has, not with the one that is being made.
+    flagged = (part.frames["raw_flags"] & (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED)) != 0
     index, onsets, targets = part.target_index, part.onset_us, part.plan.target_deg
     if provisional and len(index):
         # Only the targets that these frames belong to: a plan shorter than that knows nothing of attention.

@@ -268,6 +268,11 @@ def fit(file, output, vectors, kernel, p, budget_cycles, as_json):
             recording, vectors, kernel=kernel, p=p, budget_cycles=budget_cycles, progress=progress
         )
     doubts = [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
+    if recording.outdated:
+        doubts.append(
+            "this recording is by older firmware, whose features have another scale: its model fits no board "
+            "that runs today's; record again to use it there"
+        )
     for doubt in doubts:
         console.warn(doubt)
     output = output or os.path.splitext(file)[0] + ".sgm"

@@ -105,7 +105,7 @@ def compare(measured, reference, stored=True):
             [
                 (
                     "no sensor receives anything from any emitter",
-                    "check the common wire of all cathodes and its +2.5 V; put the headset on",
+                    "check the common wire of all cathodes and the voltage there; put the headset on",
                 )
             ],
         )

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings: what the sensors said while the eye looked at known targets, as a CSV file anyone can make.
 
+    # recording_format: 2
     # comment lines, "# key: value" is kept as meta
     t_us,s0,s1,...,s{d-1},target_az_deg,target_el_deg,valid
 
 t_us is device time, s0.. are features as the device sends them (unsigned 16 bit), targets are Fick angles in
 degrees, valid is 1 or 0; rows with valid = 0 may hold nan or nothing. Columns may stand in any order; unknown
-ones are skipped.
+ones are skipped. recording_format 2 stands for the features of firmware that speaks wire 3; those of 1, and
+of files that do not say, may have another circuit's scale. They can be read and fitted alike.
 """
 
 import csv
@@ -18,6 +20,7 @@ import numpy as np
 
 from .errors import RecordingError
 
+FORMAT = 2
 CHANNELS_MAX = 6
 TARGET_COLUMNS = ("target_az_deg", "target_el_deg")
 ANGLE_MAX_DEG = 90.0
@@ -66,6 +69,11 @@ class Recording:
             )
 
     channels = property(lambda self: self.features.shape[1])
+
+    @property
+    def outdated(self):
+        """True for a recording by older firmware, whose features had another scale: today no board has it."""
+        return "firmware" in self.meta and int(self.meta.get("recording_format", 1)) < FORMAT
 
     def __len__(self):
         return len(self.t_us)
@@ -197,6 +205,8 @@ def _parse(path, file):
             key, colon, value = line[1:].partition(":")
             if colon:
                 meta[key.strip()] = value.strip()
+            if key.strip() == "recording_format":
+                _check_format(path, number, value.strip())
         elif line and columns is None:
             columns, channels = _header(path, number, line)
         elif line:
@@ -218,6 +228,18 @@ def _parse(path, file):
         table[:, 3 + channels] == 1,
         meta,
     )
+
+
+def _check_format(path, number, text):
+    if not text.isdecimal() or len(text) > 4:
+        raise _at(path, number, f"recording_format {text[:20]!r} is no number", "remove or correct that line")
+    if int(text) > FORMAT:
+        raise _at(
+            path,
+            number,
+            f"recording_format {text} is newer than this SDK, which reads up to {FORMAT}",
+            "update this SDK, or record again with it",
+        )
 
 
 def _header(path, number, line):

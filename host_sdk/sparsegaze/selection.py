@@ -14,8 +14,9 @@ USED, SETTLING, FLAGGED, BLINK, UNSTABLE, INATTENTIVE, OUTSIDE = range(7)
 REASONS = ("used", "settling", "flagged", "blink", "unstable", "inattentive", "outside")
 
 OCTAVE = 4096.0
-LAG_FRAMES = 4  # a lid closes within 50..80 ms = 13..21 frames of 3.84 ms; noise averages over such a lag
-PAD_FRAMES = 6  # lids move slowly before and after the part that a derivative shows
+LAG_US = 15_400  # a lid closes within 50..80 ms; noise averages over such a lag
+PAD_US = 23_000  # lids move slowly before and after the part that a derivative shows
+FRAME_US = 3_840  # where the times of frames do not say
 JUMP_FLOOR = 0.012 * OCTAVE  # steps smaller than this are fixational movement, whatever the noise
 LEVEL_FLOOR = 0.020 * OCTAVE
 STRONG_JUMP = 0.05 * OCTAVE  # a lid, or a saccade of degrees; microsaccades and drift stay below
@@ -57,29 +58,38 @@ def _dilate(mask, n):
     return np.convolve(mask, np.ones(2 * n + 1), "same") > 0.5
 
 
-def blinks(features, noise=None):
+def frame_us(t_us):
+    """From frame to frame, us: the median of frames in order of time [n]."""
+    step = np.diff(np.asarray(t_us, np.int64))
+    step = step[step > 0]
+    return float(np.median(step)) if len(step) else float(FRAME_US)
+
+
+def blinks(features, noise=None, period_us=FRAME_US):
     """Frames of one fixation that are not steady gaze: bool [n], true = blink, saccade or lid in motion.
 
-    features  [n, d], consecutive frames of one settled fixation; noise: noise_of() the whole recording.
-    Two tests. Derivative: the mean of LAG_FRAMES frames against that of the next LAG_FRAMES, any channel.
+    features  [n, d], consecutive frames of one settled fixation, period_us apart; noise: noise_of() the whole
+              recording.
+    Two tests. Derivative: the mean over LAG_US against that over the next LAG_US, any channel.
     Level: the steady rest against its own densest half, any channel, which finds shut lids between two
     movements. What passes a low threshold counts only where it hangs together with something above a high
     one: the slow ends of a blink go with it, a microsaccade stays.
     """
     x = np.asarray(features, float)
     n = len(x)
-    if n < 2 * LAG_FRAMES + 1:
+    lag, pad = (max(1, int(round(span / period_us))) for span in (LAG_US, PAD_US))
+    if n < 2 * lag + 1:
         return np.ones(n, bool)
     noise = noise_of(x) if noise is None else noise
     total = np.vstack([np.zeros(x.shape[1]), np.cumsum(x, axis=0)])
-    mean = (total[LAG_FRAMES:] - total[:-LAG_FRAMES]) / LAG_FRAMES
-    step = np.abs(mean[LAG_FRAMES:] - mean[:-LAG_FRAMES])
-    limit = np.maximum(JUMP_SIGMAS * noise * np.sqrt(2.0 / LAG_FRAMES), JUMP_FLOOR)
+    mean = (total[lag:] - total[:-lag]) / lag
+    step = np.abs(mean[lag:] - mean[:-lag])
+    limit = np.maximum(JUMP_SIGMAS * noise * np.sqrt(2.0 / lag), JUMP_FLOOR)
     moving, strong = np.zeros(n, bool), np.zeros(n, bool)
-    at = slice(LAG_FRAMES, LAG_FRAMES + len(step))
+    at = slice(lag, lag + len(step))
     moving[at] = (step > limit).any(axis=1)
     strong[at] = (step > np.maximum(limit, STRONG_JUMP)).any(axis=1)
-    moving = _dilate(moving, PAD_FRAMES)
+    moving = _dilate(moving, pad)
     steady = ~_touched(moving, strong)
     if steady.sum() < LEAST_SHARE * n:
         return np.ones(n, bool)
@@ -89,7 +99,7 @@ def blinks(features, noise=None):
     limit = np.maximum(LEVEL_SIGMAS * spread, LEVEL_FLOOR)
     off = np.abs(x - centre)
     strong |= (off > np.maximum(limit, STRONG_LEVEL)).any(axis=1)
-    return _dilate(_touched(moving | (off > limit).any(axis=1) | strong, strong), PAD_FRAMES)
+    return _dilate(_touched(moving | (off > limit).any(axis=1) | strong, strong), pad)
 
 
 def _touched(weak, strong):
@@ -156,7 +166,7 @@ def select(t_us, features, flagged, target_index, onset_us, target_deg, settle_s
     features = np.asarray(features)
     index = np.asarray(target_index)
     reason = np.full(len(t_us), OUTSIDE, np.uint8)
-    noise = noise_of(features)
+    noise, period_us = noise_of(features), frame_us(t_us)
     steady = np.full((len(onset_us), features.shape[1]), np.nan)
     for k, onset in enumerate(onset_us):
         mine = np.flatnonzero(index == k)
@@ -165,7 +175,7 @@ def select(t_us, features, flagged, target_index, onset_us, target_deg, settle_s
         if not len(rows):
             continue
         bad = np.asarray(flagged)[rows].astype(bool)
-        blink = blinks(features[rows], noise)
+        blink = blinks(features[rows], noise, period_us)
         reason[rows] = np.where(bad, FLAGGED, np.where(blink, BLINK, USED))
         good = rows[reason[rows] == USED]
         if len(good) < max(5, LEAST_SHARE * len(rows)):

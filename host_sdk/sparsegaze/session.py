@@ -11,6 +11,7 @@ from typing import Optional
 
 import numpy as np
 
+from . import faults
 from .errors import CalibrationError
 from .replay import AFFINE, DEG_Q7
 
@@ -205,7 +206,8 @@ def run(device, screen, plan, gaze=False, progress=None, on_frame=None, on_targe
     device.set_stream(raw=True, gaze=gaze)
     try:
         stream = device.frames(timeout_s=FRAME_TIMEOUT_S)
-        notes += _wait_for_calm(stream, screen, on_frame, progress)
+        notes += _wait_for_calm(device, stream, screen, on_frame, progress)
+        faults.refuse(device)
         lost0 = device.lost
         end_us = None
         for frame in stream:
@@ -236,7 +238,7 @@ def run(device, screen, plan, gaze=False, progress=None, on_frame=None, on_targe
     return result
 
 
-def _wait_for_calm(stream, screen, on_frame, progress):
+def _wait_for_calm(device, stream, screen, on_frame, progress):
     """Look at the centre until no exposure has changed for CALM_S. Returns notes."""
     from ._core import lib
 
@@ -262,11 +264,12 @@ def _wait_for_calm(stream, screen, on_frame, progress):
         if late and not trouble:
             return ["the exposures were still changing when the targets began"]
         if late and calm:
+            faults.refuse(device)
             too = "much" if trouble & lib.SG_FLAG_SATURATED else "little"
             raise CalibrationError(
                 f"an LED collects too {too} light to be read",
                 "check that the headset sits in front of an open eye, away from sunlight, and that "
-                "every LED is wired; `sparsegaze info PORT` shows the exposures",
+                "every LED is wired; `sparsegaze status PORT` shows the exposures",
             )
         if late:
             return ["some readings were saturated or starved when the targets began"]

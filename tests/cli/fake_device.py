@@ -144,7 +144,7 @@ class FakeDevice:
             slot_bytes=3072,
             trial_bytes=640,
         )
-        self.port, self.baud = "/dev/fake", 1_000_000
+        self.port, self.baud = "PORT", 1_000_000
         self.frame_us, self.limit_hz, self.refuse, self.see = frame_us, limit_hz, set(refuse), see
         self.fault, self.alarm, self.supply_mv = tuple(fault), alarm, supply_mv
         self.sensing = {"rate_hz": 0, "repeats": 1, "wiring": 0, "power": 0, "rolling": 0, "lights": 1}

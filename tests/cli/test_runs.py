@@ -27,7 +27,7 @@ def test_a_recording_holds_the_plan_with_settling_marked(tmp_path, plan):
     assert len(read) == pytest.approx(12 * 1e6 / FRAME_US, abs=2)
     assert 0.45 < read.valid.mean() < 0.51
     assert len(np.unique(read.target_deg, axis=0)) == 12
-    assert device.stream[-1] == (False, False)
+    assert device.stream[-1] == (False, False, False)
 
 
 def test_valid_frames_show_the_eye_on_its_target(plan):
@@ -161,7 +161,7 @@ def test_one_wrong_bit_in_one_gaze_frame_is_found(held_out):
 def test_a_wrong_flag_in_one_gaze_frame_is_found(held_out):
     device = FakeDevice(
         linear_model(),
-        spoil=lambda seq, gaze: gaze._replace(flags=gaze.flags | lib.SG_FLAG_TRIAL) if seq == 1500 else gaze,
+        spoil=lambda seq, gaze: gaze._replace(flags=gaze.flags | lib.SG_FLAG_STARVED) if seq == 1500 else gaze,
     )
     assert validate.measure(device, device.screen, held_out).differing == 1
 

@@ -1,12 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which frames are used: synthetic fixations with drift, noise, blinks, other people's gaze."""
 
+import sys
+
 import numpy as np
 import pytest
 
 from sparsegaze import selection, targets
 
-FRAME_US = 3840
+FRAME_US = 3840  # see frame_period
+
+
+@pytest.fixture(autouse=True, params=[3840, 999], ids=["260 Hz", "1001 Hz"])
+def frame_period(request, monkeypatch):
+    """Everything holds at either rate: an eye and its lids move in time, not in frames."""
+    monkeypatch.setattr(sys.modules[__name__], "FRAME_US", request.param)
 MIX = np.array(
     [[60, 10], [-55, 20], [15, -70], [-20, 60], [45, 45], [-40, -40]], float
 )  # feature steps per degree
@@ -29,7 +37,7 @@ class Recorded:
         self.index = np.searchsorted(self.onset_us, self.t_us, side="right") - 1
         since = self.t_us - self.onset_us[self.index]
         eye = self.plan.target_deg[np.maximum(self.index - (since < 250_000), 0)].copy()
-        drift = np.cumsum(rng.normal(0, 0.1 / 12, (n, 2)), axis=0)
+        drift = np.cumsum(rng.normal(0, 0.1 / 12 * np.sqrt(FRAME_US / 3840), (n, 2)), axis=0)
         eye += drift - drift[np.searchsorted(self.t_us, self.onset_us)][self.index]
         if spoil:
             spoil(self, eye, None)

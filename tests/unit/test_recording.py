@@ -165,3 +165,38 @@ def test_arrays_that_do_not_fit_together_are_refused():
         Recording([0, 1], np.zeros((3, 6)), np.zeros((2, 2)), [1, 1])
     with pytest.raises(RecordingError, match="row 1"):
         Recording([0, 1], np.zeros((2, 6)), [[0, 0], [np.nan, 0]], [1, 1])
+
+
+def test_the_format_is_read_and_an_older_recording_still_is_but_called_outdated(file):
+    assert not Recording.read(file(HEADER + GOOD)).outdated     # somebody's own: its scale is theirs
+    assert not Recording.read(file("# firmware: 0.2.0\n# recording_format: 2\n" + HEADER + GOOD)).outdated
+    for head in ("", "# recording_format: 1\n"):
+        read = Recording.read(file("# firmware: 0.1.0\n" + head + HEADER + GOOD))
+        assert read.outdated and read.features.tolist() == [[10, 20]]
+
+
+@pytest.mark.parametrize("text, remedy", [("3", "update this SDK"), ("two", "correct"), ("-1", "correct")])
+def test_a_format_of_the_future_or_none_is_refused_by_line(file, text, remedy):
+    with pytest.raises(RecordingError, match="line 2: recording_format") as caught:
+        Recording.read(file(f"# a: b\n# recording_format: {text}\n" + HEADER + GOOD))
+    assert remedy in caught.value.remedy
+
+
+def test_four_times_the_frames_say_the_same_of_every_fixation():
+    from sparsegaze.fixations import fixations
+
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-20, 20, (30, 2))
+    slope = rng.normal(0, 60, (6, 2))
+    found = []
+    for period_us in (999, 3996):
+        t_us = np.arange(0, 30_000_000, period_us)
+        here = places[t_us // 1_000_000]
+        signal = 30000 + here @ slope.T + rng.normal(0, 25, (len(t_us), 6))
+        found.append(fixations(Recording(t_us, np.round(signal), here, np.ones(len(t_us), bool))))
+    fast, slow = found
+    assert len(fast.mean) == len(slow.mean) == 30
+    np.testing.assert_allclose(fast.noise, slow.noise, rtol=0.05)
+    np.testing.assert_allclose(fast.noise_scale(), slow.noise_scale(), rtol=0.1)
+    assert np.abs(fast.mean - slow.mean).max() < 10
+    assert len(fast.frames(50)) == len(slow.frames(50)) == 1500
