@@ -67,8 +67,8 @@ def test_swing_is_the_inverse_of_charge(bench, name):
 
 def test_the_node_of_the_rail_is_nearly_linear_and_has_the_stated_capacitance(bench):
     node = bench.node.Node(bench.node.RAIL)
-    assert node.capacitance(0.0) == pytest.approx(42, abs=1.0)
-    assert node.capacitance(1.1) == pytest.approx(46, abs=1.0)
+    assert node.capacitance(0.0) == pytest.approx(45, abs=1.0)
+    assert node.capacitance(1.1) == pytest.approx(50, abs=1.5)
 
 
 def test_an_inl_curve_is_a_drawn_curve_of_magnitude_one_with_ends_at_zero(bench):
@@ -112,10 +112,11 @@ def test_monte_carlo_and_closed_form_agree(bench, name, light):
 
 
 def test_the_closed_form_of_the_chosen_point_by_hand(bench):
-    """200 nA for 131 us are 26.2 pC on some 44 pF: one LSB is 0.18 %, converter and what it hangs on 0.8 of it."""
+    """200 nA for 131 us are 26.2 pC on some 47 pF: one LSB is 0.19 %, the converter 0.86 of it, the light 0.07 %."""
     closed = bench.methods.closed_form(bench.node.RAIL, 250, 131, 200, 0)
-    lsb_pc = 1.1 / 1024 * 44
-    assert closed == pytest.approx(0.86 * lsb_pc / 26.2, rel=0.06)
+    lsb_pc = 1.1 / 1024 * 47
+    light = 5e-3 / 2.0 / np.sqrt(13.1)
+    assert closed == pytest.approx(np.hypot(0.86 * lsb_pc / 26.2, light), rel=0.06)
 
 
 def test_the_papers_reading_loses_by_the_references_and_the_ripple(bench):
@@ -138,7 +139,7 @@ def test_more_ambient_light_than_fits_is_no_reading(bench):
 
 def test_reading_again_averages_the_converter_only(bench):
     once, four = (bench.methods.closed_form(method(bench, name), 250, 131, 200, 0) for name in ("rail", "rail_x4"))
-    assert 0.45 * once < four < 0.65 * once
+    assert 0.5 * once < four < 0.7 * once
 
 
 def test_exposures_at_a_thousand_frames_are_those_of_the_slots(bench):

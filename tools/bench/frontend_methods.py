@@ -28,13 +28,16 @@ def monte_carlo(method, adc_khz, exposure_us, photocurrent_na, ambient_na, rng, 
     """Relative RMS of n drawn readings of an ideal part about their mean; nan where it cannot be read."""
     node = node_of(method)
     unlit = 1 if ambient_na else UNLIT_MEAN
-    lit_q = node.collected(photocurrent_na + ambient_na, exposure_us)
+    lit_na = photocurrent_na + ambient_na
+    lit_q = node.collected(lit_na, exposure_us)
     unlit_q = node.collected(ambient_na, exposure_us)
     if not readable(method, node, photocurrent_na + ambient_na, exposure_us):
         return np.nan
     if method.reader != "adc":
         return _drawn_crossings(method, node, exposure_us, photocurrent_na, ambient_na, rng, n)
-    lit = _drawn_charge(method, node, adc_khz, lit_q, rng, (1, n))
+    bright = physics.emission_noise(method.headroom_v, exposure_us) * rng.standard_normal((1, n))
+    more = photocurrent_na * bright * (slope(node, exposure_us, lit_na) if method.bias_v == 0 else exposure_us * 1e-3)
+    lit = _drawn_charge(method, node, adc_khz, lit_q + more, rng, (1, n))
     dark = np.zeros((1, 1)) if method.name == "cathode_1v1" else _drawn_charge(method, node, adc_khz, unlit_q, rng, (unlit, n))
     found = lit.mean(0) - np.mean(dark, axis=0)
     if method.bias_v == 0:  # through the forward law: by the slope of charge over current
@@ -47,7 +50,7 @@ def _drawn_charge(method, node, adc_khz, charge_pc, rng, shape):
     """Charges read in `shape` exposures that collected charge_pc."""
     cs = P.node.sample_hold_pf
     first, second = method.bias_noise_v * rng.standard_normal((2, *shape))
-    charge = charge_pc + np.sqrt(physics.ELECTRON_PC * max(charge_pc, 0)) * rng.standard_normal(shape)
+    charge = charge_pc + np.sqrt(physics.ELECTRON_PC * np.maximum(charge_pc, 0)) * rng.standard_normal(shape)
     bias = method.bias_v
     if method.cathode:
         moved = physics.junction_pc(bias + first) - physics.junction_pc(bias) + P.node.pin_pf * first
@@ -75,6 +78,8 @@ def _drawn_crossings(method, node, exposure_us, photocurrent_na, ambient_na, rng
     """The same by time to threshold, in whole ticks."""
     at = threshold_v(method, node, photocurrent_na + ambient_na, exposure_us)
 
+    light = physics.emission_noise(method.headroom_v, node.charge(at) / (photocurrent_na + ambient_na) * 1e3)
+
     def current(na, mean):
         noise = np.hypot(P.comparator.noise_mv * 1e-3, threshold_noise_v(method, at))
         v = at + noise * rng.standard_normal((mean, n))
@@ -84,7 +89,8 @@ def _drawn_crossings(method, node, exposure_us, photocurrent_na, ambient_na, rng
         ticks = np.floor(charge / (na * 1e-3) / TICK_US + phase) - phase + 0.5
         return node.charge(at) / (ticks * TICK_US) * 1e3
 
-    lit = current(photocurrent_na + ambient_na, 1).mean(0)
+    bright = photocurrent_na * (1 + light * rng.standard_normal((1, n)))
+    lit = current(bright + ambient_na, 1).mean(0)
     dark = current(ambient_na, 1).mean(0) if ambient_na else 0.0
     return float((lit - dark).std() / photocurrent_na)
 
@@ -101,9 +107,10 @@ def closed_form(method, adc_khz, exposure_us, photocurrent_na, ambient_na):
     lit = charge_noise(method, node, adc_khz, node.collected(total, exposure_us))
     dark = charge_noise(method, node, adc_khz, node.collected(ambient_na, exposure_us)) / np.sqrt(unlit)
     noise = np.hypot(lit, 0 if method.name == "cathode_1v1" else dark)
+    light = physics.emission_noise(method.headroom_v, exposure_us)
     if method.bias_v == 0:
-        return float(noise / slope(node, exposure_us, total) / photocurrent_na)
-    return float(noise / (photocurrent_na * exposure_us * 1e-3))
+        return float(np.hypot(noise / slope(node, exposure_us, total) / photocurrent_na, light))
+    return float(np.hypot(noise / (photocurrent_na * exposure_us * 1e-3), light))
 
 
 def charge_noise(method, node, adc_khz, charge_pc):
@@ -136,7 +143,8 @@ def _closed_crossings(method, node, exposure_us, photocurrent_na, ambient_na):
         return na * np.sqrt((c * volts) ** 2 + np.sum(np.square(coupled)) + tick**2) / q
 
     lit, dark = noise_na(photocurrent_na + ambient_na), noise_na(ambient_na) if ambient_na else 0.0
-    return float(np.hypot(lit, dark) / photocurrent_na)
+    light = physics.emission_noise(method.headroom_v, q / (photocurrent_na + ambient_na) * 1e3)
+    return float(np.hypot(np.hypot(lit, dark) / photocurrent_na, light))
 
 
 def longest_us(method, adc_khz):

@@ -35,6 +35,12 @@ class Method:
     reader: str = "adc"  # adc | bandgap (comparator) | divider (comparator)
 
     @property
+    def headroom_v(self):
+        """Over an emitter's resistor; it emits into the rail where there is one."""
+        rail = physics.RAIL_V if self.bias_v == physics.RAIL_V else 0.0
+        return P.supply.volts - physics.FORWARD_V - rail
+
+    @property
     def full_v(self):
         """The reference."""
         return P.supply.volts if self.reference == "supply" else P.adc.bandgap_v
@@ -45,7 +51,7 @@ class Method:
         return P.node.pin_pf + (P.node.sample_hold_pf if self.reader == "adc" else 0.0)
 
 
-RAIL = Method("rail", "anode, cathode on a quiet 2.5 V rail")
+RAIL = Method("rail", "anode, cathode on a quiet 1.8 V rail")
 METHODS = (
     Method("cathode_5v", "cathode against 5 V (the paper)", 5.0, RIPPLE_V, True, "supply"),
     Method("cathode_1v1", "cathode against 1.1 V", 5.0, RIPPLE_V, True),

@@ -13,6 +13,7 @@ import warnings
 
 import frontend_methods
 import frontend_node
+import frontend_physics as physics
 import numpy as np
 from frontend_physics import P
 from threadpoolctl import threadpool_limits
@@ -51,7 +52,7 @@ def longest_us(name):
     else:
         slots, places = 2 * (size + 1), [2 + k for k in range(size)]
     slot = 1000.0 / (len(phases) * slots)
-    if slot < frontend_methods.physics.conversion_us(ADC_KHZ) + frontend_methods.SERVICE_US:
+    if slot < physics.conversion_us(ADC_KHZ) + frontend_methods.SERVICE_US:
         raise ValueError(f"{name} does not fit at {ADC_KHZ} kHz")
     most = np.empty(6)
     for phase in phases:
@@ -76,7 +77,8 @@ def relative_noise(current_na, exposure_us):
     charge = current_na * exposure_us * 1e-3
     noise = frontend_methods.charge_noise(frontend_node.RAIL, node, ADC_KHZ, charge)
     dark = frontend_methods.charge_noise(frontend_node.RAIL, node, ADC_KHZ, 0.0 * charge)
-    return np.hypot(noise, dark / np.sqrt(frontend_methods.UNLIT_MEAN)) / charge
+    light = physics.emission_noise(frontend_node.RAIL.headroom_v, exposure_us)
+    return np.hypot(np.hypot(noise, dark / np.sqrt(frontend_methods.UNLIT_MEAN)) / charge, light)
 
 
 def exposures(current_na, most_us):

@@ -18,7 +18,9 @@ PHYSICS = Path(__file__).resolve().parents[1] / "vheadset" / "physics.toml"
 BUILT_IN_V, GRADING = 0.7, 0.4  # of the junction: comment of [node] junction_pf
 SLOW_KHZ, FAST_KHZ, FAST_FACTOR = 200.0, 1000.0, 2.25  # comments of [adc]
 BANDGAP_NOISE_V, BANDGAP_PART = 0.2e-3, 0.10
-RAIL_V, RAIL_NOISE_V = 2.5, 0.2e-3  # our own parts: a TL431 and 10 uF (headset file, [board])
+RAIL_V, RAIL_NOISE_V = 1.8, 0.2e-3  # our own parts: a shunt regulator and 10 uF (headset file, [board])
+FORWARD_V = 1.2  # of an emitter
+RIPPLE_US = 10.0  # the supply's ripple is drawn anew so often, and the light follows it
 IDEALITY, THERMAL_V = 2.0, 0.02585  # forward law of the junction; its saturation current is the leakage
 ELECTRON_PC = 1.602e-7
 CODES = 1024
@@ -60,6 +62,12 @@ def adc_noise_lsb(adc_khz):
 def conversion_us(adc_khz):
     """Of one conversion after the first."""
     return 13e3 / adc_khz
+
+
+def emission_noise(headroom_v, exposure_us):
+    """RMS over mean of the light in an exposure, by the ripple on what drives the emitters' resistors."""
+    draws = np.maximum(np.asarray(exposure_us, float) / RIPPLE_US, 1.0)
+    return P.supply.ripple_mv * 1e-3 / headroom_v / np.sqrt(draws)
 
 
 def inl_curve(rng):

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Latency in exact cycles, from the virtual Nano's log of pins, samples and sent bytes (`frames on`).
+
+Rows event,cycle: lit:<mask> emitters that light from then on; drive<i>:<how> pin i (3: floating); adc:<channel> the
+instant of a sample; delimiter the end of a sent packet's last byte. A sensing cycle has six lit samples of channels
+0..5 and six unlit ones; a frame's time is the mean of the middles of its six lit exposures.
+"""
+
+import csv
+
+import numpy as np
+
+CYCLES_PER_MS = 16_000.0
+FLOATING = 3
+CHANNELS, SAMPLES = 6, 12
+
+
+def read(path):
+    """[(event, cycle)] of a log."""
+    with open(path, newline="", encoding="ascii") as file:
+        return [(row["event"], int(row["cycle"])) for row in csv.DictReader(file)]
+
+
+def cycles_of(rows):
+    """(mean [n], last [n], sent [m]): mean sample time and last sample of every sensing cycle, ends of packets."""
+    lit, released, middles, samples, sent = 0, {}, [], [], []
+    mean, last, before = [], [], None
+    for event, cycle in rows:
+        kind, _, value = event.partition(":")
+        if kind == "lit":
+            lit = int(value)
+        elif kind.startswith("drive"):
+            if int(value) == FLOATING:
+                released[int(kind[5:])] = cycle
+        elif kind == "delimiter":
+            sent.append(cycle)
+        elif kind == "adc" and int(value) < CHANNELS:
+            channel = int(value)
+            if lit and before is not None and not before[1] and len(middles) == CHANNELS:
+                middles, samples = [], []       # the first pair again
+            before = (channel, lit)
+            samples.append(cycle)
+            if lit and channel in released:
+                middles.append((released[channel] + cycle) / 2)
+            if len(middles) == CHANNELS and len(samples) >= SAMPLES:
+                mean.append(np.mean(middles))
+                last.append(cycle)
+                middles, samples = [], []
+    return np.array(mean), np.array(last), np.array(sent)
+
+
+def latency(path):
+    """Milliseconds of device time from mean and last sample to the last byte of the gaze, mean and maximum.
+
+    Of frames after which just one packet was sent before the next was due: answers to pings are left out.
+    """
+    mean, last, sent = cycles_of(read(path))
+    first = np.searchsorted(sent, last[:-1], side="right")
+    alone = np.searchsorted(sent, last[1:], side="right") - first == 1
+    ends = sent[first[alone]]
+    from_mean = (ends - mean[:-1][alone]) / CYCLES_PER_MS
+    from_last = (ends - last[:-1][alone]) / CYCLES_PER_MS
+    return {
+        "frames": int(alone.sum()),
+        "latency_mean_ms": float(from_mean.mean()),
+        "latency_mean_max_ms": float(from_mean.max()),
+        "latency_last_ms": float(from_last.mean()),
+        "latency_last_max_ms": float(from_last.max()),
+    }
