@@ -55,7 +55,7 @@ def check_wiring(headset, file):
             "wire the divider to %s, or leave supply_pin out when there is none" % SUPPLY_PIN,
         )
     if "rail_volts" not in board:
-        raise SceneError("%s: board: rail_volts is missing" % file, "the rail of the shunt regulator, 2.5")
+        raise SceneError("%s: board: rail_volts is missing" % file, "the rail of the shunt regulator, 1.8")
     phases = tuple((phase.sense, tuple(sorted(phase.light))) for phase in headset.phases)
     if phases and phases != PHASES[kind]:
         raise SceneError(

@@ -17,7 +17,7 @@ aim_mm = [0.0, 0.0, -11.0]
 lens_radius_mm = 1.5
 pin = "{pin}"
 """
-BOARD = '[board]\nwiring = "{wiring}"\nrail_volts = 2.5\nsupply_pin = "A7"\n'
+BOARD = '[board]\nwiring = "{wiring}"\nrail_volts = 1.8\nsupply_pin = "A7"\n'
 PAIRS = ((5, 0), (1, 4), (2, 3))
 DIODE_PAIRS = ((0, 3), (1, 4), (2, 5))
 
@@ -98,10 +98,10 @@ def test_a_headset_without_wiring_may_have_any_free_pins(tmp_path):
         (diodes().replace('"D2"', '"A0"'), "pd0 and ir0 are both on pin A0"),
         (diodes() + entry("emitter", "ir3", 12, "D5"), "has 3 emitters, not 4"),
         (leds(False) + entry("led", "led6", 20, "D9"), "has 6 sensors, not 7"),
-        (leds().replace("rail_volts = 2.5\n", ""), "rail_volts is missing"),
-        (leds().replace("rail_volts = 2.5", "rail_volts = 25"), "rail_volts = 25"),
-        (leds().replace("rail_volts = 2.5", "rail_volts = nan"), "rail_volts = nan"),
-        (leds().replace("rail_volts = 2.5", 'rail_volts = "2.5"'), "rail_volts"),
+        (leds().replace("rail_volts = 1.8\n", ""), "rail_volts is missing"),
+        (leds().replace("rail_volts = 1.8", "rail_volts = 25"), "rail_volts = 25"),
+        (leds().replace("rail_volts = 1.8", "rail_volts = nan"), "rail_volts = nan"),
+        (leds().replace("rail_volts = 1.8", 'rail_volts = "2.5"'), "rail_volts"),
         (leds().replace('light = ["led1"', 'light = ["led9"'), "no emitter led9"),
         (leds().replace('sense = ["led5"', 'sense = ["led9"'), "no sensor led9"),
         (diodes().replace('sense = ["pd0"', 'sense = ["ir0"'), "no sensor ir0"),
