@@ -2,13 +2,12 @@
 #include "leds.h"
 
 #include <math.h>
-#include <simavr/avr_ioport.h>
+#include <string.h>
 
-#include "access.h"
 #include "adc.h"
 #include "noise.h"
 
-enum { PINC = 0x26, MCUCR = 0x55, PUD = 0x10, EMITTER_PIN = 2 };
+enum { EMITTER_PIN = 2 };
 static const double PULLUP_OHM = 35e3, DRIVER_OHM = 25;    // of a port pin: datasheet, pin pull-up and driver
 static const double LEAKAGE_DOUBLES_K = 10;                // comment of physics.toml, [node]
 static const double DIVIDER = 0.04;                        // 240k and 10k, with a capacitor: stiff
@@ -170,9 +169,9 @@ static void let_go(struct leds *l, int i, double volts)
 static enum led_drive drive_of(const struct leds *l, int i)
 {
     uint8_t bit = (uint8_t)(1 << i);
-    if (l->ddr_c & bit)
-        return l->port_c & bit ? LED_HIGH : LED_LOW;
-    return (l->port_c & bit) && !(l->avr->data[MCUCR] & PUD) ? LED_PULLUP : LED_FLOAT;
+    if (l->pins.ddr_c & bit)
+        return l->pins.port_c & bit ? LED_HIGH : LED_LOW;
+    return (l->pins.port_c & bit) && l->pins.pull_ups ? LED_PULLUP : LED_FLOAT;
 }
 
 static void enter(struct leds *l, int i, enum led_drive drive, uint64_t now)
@@ -196,7 +195,7 @@ static struct lamps_on emitters_on(struct leds *l)
     struct lamps_on on = {0, 0, 0};
     if (l->wiring->photodiodes) {
         for (int i = 0; i < LEDS_EMITTERS; i++)
-            if (l->port_d & l->ddr_d & 1 << (EMITTER_PIN + i) && l->part[LEDS_COUNT + i].fault != FAULT_OPEN)
+            if (l->pins.port_d & l->pins.ddr_d & 1 << (EMITTER_PIN + i) && l->part[LEDS_COUNT + i].fault != FAULT_OPEN)
                 on.lit |= (uint8_t)(1 << i);
         return on;
     }
@@ -209,9 +208,10 @@ static struct lamps_on emitters_on(struct leds *l)
     return on;
 }
 
-static void pins_changed(struct leds *l, uint64_t now)
+void leds_drive(struct leds *l, const struct leds_pins *pins, uint64_t now)
 {
     leds_settle(l, now);
+    l->pins = *pins;
     lamps_switch(&l->lamps, emitters_on(l), now);
     for (int i = 0; i < LEDS_COUNT; i++)     // released against the rail of the new lights
         enter(l, i, drive_of(l, i), now);
@@ -306,54 +306,14 @@ double leds_peek(struct leds *l, int i, uint64_t cycle)
     return volts_of(&copy, i, cycle, 0, 0);
 }
 
-static void port_c(avr_irq_t *irq, uint32_t value, void *param)
+uint8_t leds_digital(struct leds *l, uint64_t cycle)
 {
-    struct leds *l = param;
-    (void)irq;
-    l->port_c = (uint8_t)value;
-    pins_changed(l, access_write_cycle(l->avr));
-}
-
-static void ddr_c(avr_irq_t *irq, uint32_t value, void *param)
-{
-    struct leds *l = param;
-    (void)irq;
-    l->ddr_c = (uint8_t)value;
-    pins_changed(l, access_write_cycle(l->avr));
-}
-
-static void port_d(avr_irq_t *irq, uint32_t value, void *param)
-{
-    struct leds *l = param;
-    (void)irq;
-    l->port_d = (uint8_t)value;
-    if (l->wiring->photodiodes)
-        pins_changed(l, access_write_cycle(l->avr));
-}
-
-static void ddr_d(avr_irq_t *irq, uint32_t value, void *param)
-{
-    struct leds *l = param;
-    (void)irq;
-    l->ddr_d = (uint8_t)value;
-    if (l->wiring->photodiodes)
-        pins_changed(l, access_write_cycle(l->avr));
-}
-
-// Digital level of the anodes: libsimavr has no notion of a floating pin.
-static uint8_t read_pins(avr_t *avr, avr_io_addr_t at, void *param)
-{
-    struct leds *l = param;
-    uint64_t now = access_read_cycle(avr);
-    uint8_t value = (uint8_t)(l->port_c & l->ddr_c);
-    adc_catch_up(l->adc, now);
+    uint8_t value = (uint8_t)(l->pins.port_c & l->pins.ddr_c);
+    leds_settle(l, cycle);
     for (int i = 0; i < LEDS_COUNT; i++)
-        if (!(l->ddr_c >> i & 1)) {
-            bring_to(l, i, now);
-            if (volts_of(l, i, now, 0, 0) > l->lamps.supply_volts / 2)
-                value |= (uint8_t)(1 << i);
-        }
-    return avr->data[at] = value;
+        if (!(l->pins.ddr_c >> i & 1) && volts_of(l, i, cycle, 0, 0) > l->lamps.supply_volts / 2)
+            value |= (uint8_t)(1 << i);
+    return value;
 }
 
 void leds_seed(struct leds *l, uint64_t seed)
@@ -362,16 +322,11 @@ void leds_seed(struct leds *l, uint64_t seed)
     light_seed(&l->light, seed);
 }
 
-void leds_attach(struct leds *l, avr_t *avr, struct adc *adc, struct person *person,
-                 const struct sim_map *map, const struct config *config, double cycles_per_true_second)
+void leds_attach(struct leds *l, struct adc *adc, struct person *person, const struct sim_map *map,
+                 const struct config *config, double cycles_per_true_second)
 {
-    static const struct { char port; int irq; avr_irq_notify_t call; } hooks[] = {
-        {'C', IOPORT_IRQ_REG_PORT, port_c}, {'C', IOPORT_IRQ_DIRECTION_ALL, ddr_c},
-        {'D', IOPORT_IRQ_REG_PORT, port_d}, {'D', IOPORT_IRQ_DIRECTION_ALL, ddr_d},
-    };
     const struct physics *p = &config->physics;
     memset(l, 0, sizeof *l);
-    l->avr = avr;
     l->joined = -1;
     l->adc = adc;
     l->physics = p;
@@ -389,22 +344,13 @@ void leds_attach(struct leds *l, avr_t *avr, struct adc *adc, struct person *per
         l->led[i].part = i;
     light_attach(&l->light, p, map, person, config, cycles_per_true_second);
     lamps_attach(&l->lamps, config);
-    for (size_t i = 0; i < sizeof hooks / sizeof *hooks; i++) {
-        avr_irq_t *irq = avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ(hooks[i].port), hooks[i].irq);
-        irq->flags &= (uint8_t)~IRQ_FLAG_FILTERED;  // a reset changes pins behind its back
-        avr_irq_register_notify(irq, hooks[i].call, l);
-    }
-    access_take_read(avr, PINC, read_pins, l);
-    leds_reset(l, true);
+    leds_empty(l, 0);
 }
 
-void leds_reset(struct leds *l, bool fresh)
+void leds_empty(struct leds *l, uint64_t cycle)
 {
-    uint64_t now = l->avr->cycle;
-    l->port_c = l->ddr_c = l->port_d = l->ddr_d = 0;
-    pins_changed(l, now);
-    for (int i = 0; fresh && i < LEDS_COUNT; i++) {
-        l->led[i].since = l->led[i].event = now;
+    for (int i = 0; i < LEDS_COUNT; i++) {
+        l->led[i].since = l->led[i].event = cycle;
         let_go(l, i, 0);
     }
 }

@@ -23,8 +23,6 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include <simavr/sim_avr.h>
-
 #include "charge.h"
 #include "config.h"
 #include "lamps.h"
@@ -54,8 +52,9 @@ struct led {                   // a pin of port C
     int part;
 };
 
+struct leds_pins { uint8_t port_c, ddr_c, port_d, ddr_d; bool pull_ups; };  // registers; pull-ups enabled
+
 struct leds {
-    avr_t *avr;
     const struct physics *physics;
     const struct board_wiring *wiring;
     struct adc *adc;
@@ -63,17 +62,22 @@ struct leds {
     struct lamps lamps;
     uint64_t seed;
     double warmer_k;           // headset temperature above 25 C
-    uint8_t port_c, ddr_c, port_d, ddr_d;
+    struct leds_pins pins;
     uint64_t releases, samples;                // count draws
     int joined;                                // pin whose node carries the sample capacitor, or -1
     struct led led[LEDS_COUNT];
     struct led_part part[LEDS_PARTS];
 };
 
-void leds_attach(struct leds *leds, avr_t *avr, struct adc *adc, struct person *person,
-                 const struct sim_map *map, const struct config *config, double cycles_per_true_second);
-// After every reset of the chip: all pins are inputs. fresh: power was off, every node is empty.
-void leds_reset(struct leds *leds, bool fresh);
+// All pins are inputs at first. adc must be attached before time passes.
+void leds_attach(struct leds *leds, struct adc *adc, struct person *person, const struct sim_map *map,
+                 const struct config *config, double cycles_per_true_second);
+// The pins are driven like this from a cycle on.
+void leds_drive(struct leds *leds, const struct leds_pins *pins, uint64_t cycle);
+// The power was off: every node is empty.
+void leds_empty(struct leds *leds, uint64_t cycle);
+// What PINC reads at a cycle.
+uint8_t leds_digital(struct leds *leds, uint64_t cycle);
 
 // Draw noise from here on: the seed of a session.
 void leds_seed(struct leds *leds, uint64_t seed);

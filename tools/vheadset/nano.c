@@ -79,7 +79,9 @@ static void after_reset(struct nano *nano, enum nano_reset cause)
     adc_reset(&nano->adc);
     eeprom_reset(&nano->eeprom);
     selfprog_reset(&nano->selfprog);
-    leds_reset(&nano->leds, cause == NANO_RESET_POWER);
+    pins_reset(&nano->pins);
+    if (cause == NANO_RESET_POWER)
+        leds_empty(&nano->leds, avr->cycle);
     markers_reset(&nano->markers);
     watchdog_reset(&nano->watchdog, nano->reset_flags & NANO_RESET_WATCHDOG);
     uart_reset(&nano->uart);
@@ -284,8 +286,9 @@ int nano_open(struct nano *nano, const struct config *config, struct bridge *bri
     selfprog_attach(&nano->selfprog, avr, config->bootloader_start);
     eeprom_attach(&nano->eeprom, avr);
     person_init(&nano->person, config, noise_session(config->seed, nano->session));
-    leds_attach(&nano->leds, avr, &nano->adc, &nano->person, nano->map, config, nano->cycles_per_true_second);
+    leds_attach(&nano->leds, &nano->adc, &nano->person, nano->map, config, nano->cycles_per_true_second);
     adc_attach(&nano->adc, avr, &nano->leds, &nano->config.physics, config->seed);
+    pins_attach(&nano->pins, avr, &nano->leds);
     nano->adc.before = before_cycle;
     nano->adc.before_param = nano;
     timer1_attach(&nano->timer1, avr, &nano->adc);

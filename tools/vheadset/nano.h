@@ -16,6 +16,7 @@
 #include "leds.h"
 #include "markers.h"
 #include "person.h"
+#include "pins.h"
 #include "schedule.h"
 #include "selfprog.h"
 #include "timer1.h"
@@ -37,6 +38,7 @@ struct nano {
     struct selfprog selfprog;
     struct watchdog watchdog;
     struct leds leds;
+    struct pins pins;
     struct person person;
     struct markers markers;
     struct schedule schedule;
