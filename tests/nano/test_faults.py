@@ -7,8 +7,8 @@ import pytest
 from board import QUIET, Board, firmware, uniform_map
 from test_leds import DARK, HIGH_SAMPLER, PIN, RAIL, SAMPLER, VOLTS, charge_pc, exposure, lit_cycles
 
-ALL, TICKS = 0b111110, 1200
-OHM = (5 - 1.2 - 2.5) / 0.020           # what is in series with each LED: 20 mA at 5 V
+ALL, TICKS = 0b111110, 900
+OHM = (5 - 1.2 - RAIL) / 0.020          # what is in series with each LED: 20 mA at 5 V
 
 
 def current_na(board, lit=ALL, **options):

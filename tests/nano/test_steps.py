@@ -61,11 +61,11 @@ def lit(flat_map):
 
 @pytest.mark.parametrize("cycles", [-1000, -1, 0, 1, 2, 3, 7, 777, 778, 779, 780, 1501, 1700])
 def test_ambient_step_in_the_middle_of_an_exposure_is_integrated_exactly(dark, cycles):
-    held = dark.held((-1500, "ambient_na", 30), (cycles, "ambient_na", 900))
+    held = dark.held((-1500, "ambient_na", 30), (cycles, "ambient_na", 600))
     turn = max(cycles, 0) / 16e6
-    assert abs(held - volts_of((30 * turn + 900 * (dark.seconds - turn)) * 1e-3 * 1e6, SAMPLER)) < 1e-9
+    assert abs(held - volts_of((30 * turn + 600 * (dark.seconds - turn)) * 1e-3 * 1e6, SAMPLER)) < 1e-9
     # the sampler, at 0 V, joins late; it is as if it had hung there from the release on
-    pieces = [(lambda t: 30.0, 0.0, turn)] * (turn > 0) + [(lambda t: 900.0, turn, dark.seconds)]
+    pieces = [(lambda t: 30.0, 0.0, turn)] * (turn > 0) + [(lambda t: 600.0, turn, dark.seconds)]
     assert abs(held - integrated(pieces, extra_pf=SAMPLER)) < 1e-9
 
 
@@ -90,8 +90,8 @@ def test_of_one_cycle_the_later_given_wins(dark):
 
 
 @pytest.mark.parametrize("key,value,ratio", [
-    ("light", "dim", 75 / 200), ("light", "bright", 3), ("warmer_k", 20, 0.9), ("supply_volts", 4.35, 0.5),
-    ("supply_volts", 5.26, 1.2), ("fault_1", "open", 0.8), ("fault_0", "covered", 0.01)])
+    ("light", "dim", 75 / 200), ("light", "bright", 3), ("warmer_k", 20, 0.9), ("supply_volts", 4.3, 0.65),
+    ("supply_volts", 5.4, 1.2), ("fault_1", "open", 0.8), ("fault_0", "covered", 0.01)])
 def test_step_of_what_lights_the_node(lit, key, value, ratio):
     cycles = 803
     collected = charge_pc(lit.held((cycles, key, value)), SAMPLER)

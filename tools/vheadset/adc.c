@@ -72,6 +72,8 @@ void adc_catch_up(struct adc *a, uint64_t cycle)
         return;
     uint64_t at = a->sample_at;
     a->sample_at = 0;
+    if (a->log)
+        a->log(a->log_param, "adc", channel, at);
     if (channel < LEDS_COUNT)
         a->held_volts = leds_sample(a->leds, channel, at);
     else if (channel == CHANNEL_TEMPERATURE)

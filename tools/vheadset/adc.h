@@ -44,6 +44,8 @@ struct adc {
     unsigned divisor;             // as latched at the start
     void (*before)(void *param, uint64_t cycle);  // what else is due by then, called first; may be NULL
     void *before_param;
+    void (*log)(void *param, const char *what, int value, uint64_t cycle);  // "adc" and channel; may be NULL
+    void *log_param;
 };
 
 void adc_attach(struct adc *adc, avr_t *avr, struct leds *leds, const struct physics *physics, uint64_t seed);

@@ -6,8 +6,8 @@
 #include <stdlib.h>
 #include <string.h>
 
-// The board's own parts, README.md: a TL431 as shunt of 2.5 V, the divider on A7.
-static const double RAIL_VOLTS = 2.5, RAIL_OHM = 0.3, RAIL_NOISE_MV = 0.2;
+// The board's own parts, README.md: a shunt regulator of 1.8 V, the divider on A7.
+static const double RAIL_VOLTS = 1.8, RAIL_OHM = 0.3, RAIL_NOISE_MV = 0.2;
 static const int SUPPLY_CHANNEL = 7;
 // A lit LED needs its forward voltage and something to set its current by.
 static const double SUPPLY_OVER_RAIL_VOLTS = 1.3;
@@ -143,7 +143,7 @@ static int store(struct config *c, bool *seen, const char *key, const char *valu
         return bad;
     }
     if (!strcmp(key, "rail_volts"))
-        return number(value, 1.5, 3.5, &c->wiring.rail_volts);
+        return number(value, 1, 3.5, &c->wiring.rail_volts);
     if (!strcmp(key, "rail_ohm"))
         return number(value, 0, 20, &c->wiring.rail_ohm);
     if (!strcmp(key, "rail_noise_mv"))

@@ -4,15 +4,41 @@
 #include <math.h>
 #include <string.h>
 
+#include "noise.h"
+
 static const double LED_AMPERES = 0.020;  // stated in the comment of physics.toml, [photocurrent]
 static const double FORWARD_VOLTS = 1.2;  // of an infrared LED
 enum { LOAD_STEPS = 60 };                 // each halves the error at least
 
+// Draws of ripple are independent from sample to sample: samples are 13 us apart at 1 MHz at least.
+enum { RIPPLE_CYCLES = 160 };
+
+// What an unloaded supply leaves for the resistance in series.
+static double headroom_volts(const struct lamps *l, double supply)
+{
+    return supply - FORWARD_VOLTS - (l->wiring->photodiodes ? 0 : l->wiring->rail_volts);
+}
+
 // What makes 20 mA at the configured supply.
 static double series_ohm(const struct lamps *l)
 {
-    double end = l->wiring->photodiodes ? 0 : l->wiring->rail_volts;
-    return (l->physics->supply.volts - FORWARD_VOLTS - end) / LED_AMPERES;
+    return headroom_volts(l, l->physics->supply.volts) / LED_AMPERES;
+}
+
+double lamps_light(const struct lamps *l, uint64_t seed, uint64_t from, uint64_t to)
+{
+    double ripple = l->physics->supply.ripple_mv * 1e-3, sum = 0;
+    if (ripple == 0 || to <= from || l->level == 0)
+        return l->level;
+    for (uint64_t at = from; at < to;) {
+        uint64_t draw = at / RIPPLE_CYCLES, end = (draw + 1) * RIPPLE_CYCLES;
+        if (end > to)
+            end = to;
+        sum += (double)(end - at) * noise_normal(seed, NOISE_RIPPLE_LIGHT, draw);
+        at = end;
+    }
+    double mean = sum / (double)(to - from) * ripple;
+    return l->level * fmax(1 + mean / headroom_volts(l, l->supply_volts), 0);
 }
 
 static void load(struct lamps *l, uint64_t cycle)

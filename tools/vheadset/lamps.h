@@ -4,7 +4,8 @@
 //
 // Each path is linear: supply - source_ohm * all current, then the drop of the diode (1.2 V; none when it is
 // shorted), then the resistance in series (what makes 20 mA at the configured supply, resistor and port
-// driver together), then the rail (wiring leds) or ground. Light is proportional to current.
+// driver together), then the rail (wiring leds) or ground. Light is proportional to current, and carries the
+// supply's ripple.
 #ifndef LAMPS_H
 #define LAMPS_H
 
@@ -42,6 +43,9 @@ void lamps_attach(struct lamps *lamps, const struct config *config);
 // From a cycle on these are on.
 void lamps_switch(struct lamps *lamps, struct lamps_on on, uint64_t cycle);
 void lamps_set_supply(struct lamps *lamps, double volts, uint64_t cycle);
+// Mean light of an emitter that is lit now, between two cycles, 1 = at 20 mA: `level`, with the ripple of a
+// session's seed. Its draws hold for 10 us each, on a grid of the device's time.
+double lamps_light(const struct lamps *lamps, uint64_t seed, uint64_t from, uint64_t to);
 // Supply at a recent cycle, loaded, without ripple.
 double lamps_supply_at(const struct lamps *lamps, uint64_t cycle);
 

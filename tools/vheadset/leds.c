@@ -7,6 +7,7 @@
 #include "adc.h"
 #include "noise.h"
 
+static const char *const DRIVE_NAMES[LEDS_COUNT] = {"drive0", "drive1", "drive2", "drive3", "drive4", "drive5"};
 enum { EMITTER_PIN = 2 };
 static const double PULLUP_OHM = 35e3, DRIVER_OHM = 25;    // of a port pin: datasheet, pin pull-up and driver
 static const double LEAKAGE_DOUBLES_K = 10;                // comment of physics.toml, [node]
@@ -75,12 +76,12 @@ static double volts_of(struct leds *l, int i, uint64_t cycle, double supply_nois
     return charge_volts(node_of(l, i, noise_volts), l->led[i].charge_pc);
 }
 
-// Light of an emitter, 1 = a nominal one at 20 mA.
+// Light of a lit emitter relative to that of a nominal one at the same current.
 static double brightness(const struct leds *l, int emitter)
 {
     const struct led_part *part = &l->part[l->wiring->photodiodes ? LEDS_COUNT + emitter
                                                                   : l->led[emitter].part];
-    return l->lamps.level * part->emitter * (part->fault == FAULT_COVERED ? COVERED : 1)
+    return part->emitter * (part->fault == FAULT_COVERED ? COVERED : 1)
          * (1 + l->physics->photocurrent.heat_per_k * l->warmer_k);
 }
 
@@ -97,11 +98,12 @@ static double current_na(struct leds *l, int i, uint64_t from, uint64_t to)
     const double *response = l->lamps.on.lit ? light_response(&l->light, from + (to - from) / 2) : NULL;
     double sum = 0, all = 0;
     if (response) {
+        double light = lamps_light(&l->lamps, l->seed, from, to);
         int emitters = l->wiring->photodiodes ? LEDS_EMITTERS : LEDS_COUNT;
         for (int pin = 0; pin < emitters; pin++)
             if (l->lamps.on.lit >> pin & 1) {
                 int column = l->wiring->photodiodes ? pin : l->led[pin].part;
-                double bright = brightness(l, pin);
+                double bright = light * brightness(l, pin);
                 sum += response[l->led[i].part * emitters + column] * bright;
                 all += bright;
             }
@@ -166,6 +168,12 @@ static void let_go(struct leds *l, int i, double volts)
     led->charge_pc = charge_at(node_of(l, i, rail_noise(l, NOISE_RAIL_RELEASE, l->releases++)), volts);
 }
 
+static void record(const struct leds *l, const char *what, int value, uint64_t cycle)
+{
+    if (l->log)
+        l->log(l->log_param, what, value, cycle);
+}
+
 static enum led_drive drive_of(const struct leds *l, int i)
 {
     uint8_t bit = (uint8_t)(1 << i);
@@ -184,6 +192,7 @@ static void enter(struct leds *l, int i, enum led_drive drive, uint64_t now)
     bool released = drive == LED_FLOAT;
     led->drive = drive;
     led->since = led->event = now;
+    record(l, DRIVE_NAMES[i], drive, now);
     if (released)
         let_go(l, i, volts);
     else
@@ -208,11 +217,19 @@ static struct lamps_on emitters_on(struct leds *l)
     return on;
 }
 
+static void shine(struct leds *l, uint64_t cycle)
+{
+    uint8_t was = l->lamps.on.lit;
+    lamps_switch(&l->lamps, emitters_on(l), cycle);
+    if (l->lamps.on.lit != was)
+        record(l, "lit", l->lamps.on.lit, cycle);
+}
+
 void leds_drive(struct leds *l, const struct leds_pins *pins, uint64_t now)
 {
     leds_settle(l, now);
     l->pins = *pins;
-    lamps_switch(&l->lamps, emitters_on(l), now);
+    shine(l, now);
     for (int i = 0; i < LEDS_COUNT; i++)     // released against the rail of the new lights
         enter(l, i, drive_of(l, i), now);
 }
@@ -229,7 +246,7 @@ static void rewire(struct leds *l, const double *volts, uint64_t cycle)
     for (int i = 0; i < LEDS_COUNT; i++)
         if (l->led[i].drive == LED_FLOAT)
             l->led[i].charge_pc = charge_at(node_of(l, i, 0), volts[i]);
-    lamps_switch(&l->lamps, emitters_on(l), cycle);
+    shine(l, cycle);
 }
 
 static void look(struct leds *l, double *volts, uint64_t cycle)

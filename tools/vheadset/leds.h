@@ -65,6 +65,9 @@ struct leds {
     struct leds_pins pins;
     uint64_t releases, samples;                // count draws
     int joined;                                // pin whose node carries the sample capacitor, or -1
+    // Told "drive0".."drive5" with the new enum led_drive and "lit" with the new mask; may be NULL.
+    void (*log)(void *param, const char *what, int value, uint64_t cycle);
+    void *log_param;
     struct led led[LEDS_COUNT];
     struct led_part part[LEDS_PARTS];
 };

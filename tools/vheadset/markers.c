@@ -44,6 +44,13 @@ void markers_log(struct markers *m, const char *what, uint64_t cycle)
         fprintf(m->frames, "%s,%" PRIu64 "\n", what, cycle);
 }
 
+void markers_log_value(void *param, const char *what, int value, uint64_t cycle)
+{
+    struct markers *m = param;
+    if (m->frames)
+        fprintf(m->frames, "%s:%d,%" PRIu64 "\n", what, value, cycle);
+}
+
 static void write_frame(avr_t *avr, avr_io_addr_t at, uint8_t value, void *param)
 {
     avr->data[at] = value;

@@ -41,5 +41,7 @@ void markers_clear(struct markers *markers);
 void markers_print(const struct markers *markers, char *text, size_t bytes);
 // A row of the frame log, if there is one.
 void markers_log(struct markers *markers, const char *what, uint64_t cycle);
+// The same with a number: "what:value". param: struct markers.
+void markers_log_value(void *param, const char *what, int value, uint64_t cycle);
 
 #endif

@@ -289,6 +289,8 @@ int nano_open(struct nano *nano, const struct config *config, struct bridge *bri
     leds_attach(&nano->leds, &nano->adc, &nano->person, nano->map, config, nano->cycles_per_true_second);
     adc_attach(&nano->adc, avr, &nano->leds, &nano->config.physics, config->seed);
     pins_attach(&nano->pins, avr, &nano->leds);
+    nano->leds.log = nano->adc.log = markers_log_value;
+    nano->leds.log_param = nano->adc.log_param = &nano->markers;
     nano->adc.before = before_cycle;
     nano->adc.before_param = nano;
     timer1_attach(&nano->timer1, avr, &nano->adc);
