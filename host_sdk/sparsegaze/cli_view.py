@@ -42,7 +42,7 @@ class Gaze(click.ParamType):
     "--emitter",
     type=int,
     multiple=True,
-    help="One that is lit; repeatable.  [default: all but the sensor's own]",
+    help="One that is lit; repeatable.  [default: those of its phase]",
 )
 @click.option(
     "--pixels", type=click.IntRange(16, 4096), default=512, show_default=True, help="Of the image's side."

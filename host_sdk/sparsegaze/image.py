@@ -282,15 +282,14 @@ def view(
 ):
     """The View of one sensor at one state.
 
-    emitters    numbers of those that are lit; default all but the one at the sensor's own place (or that
-                one, when it is the only one)
+    emitters    numbers of those that are lit; default those that are while this sensor senses (Headset.lit)
     samples     a pixel is the mean of samples x samples points in it; pixels * samples <= 4096
     """
     if samples < 1 or pixels * samples > 4096:
         raise SceneError("%d pixels of %d x %d samples" % (pixels, samples, samples), "at most 4096 in a row")
     method = ImageMethod(headset, person, slip_mm, pixels * samples, half_width_sigmas, renderer)
     if emitters is None:
-        emitters = _others(headset, sensor)
+        emitters = _lit(headset, sensor)
     camera = method.camera(sensor, emitters)
     parts = camera.render_parts(azimuth_deg, elevation_deg, pupil_mm, lid_opening)
     blocks = (len(emitters), pixels, samples, pixels, samples)
@@ -311,12 +310,10 @@ def view(
     )
 
 
-def _others(headset, sensor):
-    count = len(headset.emitters)
+def _lit(headset, sensor):
     if not 0 <= sensor < len(headset.sensors):
-        return range(count)
-    here = headset.sensors[sensor].position_mm
-    return [e for e in range(count) if headset.emitters[e].position_mm != here] or range(count)
+        return range(len(headset.emitters))  # refused by the camera, in its words
+    return np.flatnonzero(headset.lit[sensor]).tolist()
 
 
 @lru_cache(maxsize=4)
