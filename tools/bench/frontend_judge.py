@@ -3,6 +3,15 @@
 
 import sys
 
+from frontend_size import RAM_BYTES
+
+RATE_HZ, VECTORS_AIM = 1000.0, 64
+TRUTH_RATIO = 1.05  # of the inference benchmark: the device's error over the full process's
+LATENCY_MEAN_MS, LATENCY_LAST_MS = 2.5, 1.5
+S2S_DEG, S2S_250_DEG, OVER_BOUND = 0.35, 0.18, 1.15
+RATIO = {"room": 1.1, "bright_room": 1.5, "sun_gap": 3.0}
+STEP_SATURATED, STEP_SETTLE = 5, 10
+FLICKER, IRRADIANCE_W_M2, SPARE = 1.2, 100.0, 0.10
 BITS_APART = 0.25  # closed form against Monte Carlo of 500 draws: 5 standard errors
 
 
@@ -25,6 +34,36 @@ def bars(report):
     if report.get("patterns"):
         best = report["patterns"][0]
         most("patterns: chosen over best, RMS-S2S", _chosen(report)["s2s_mean_deg"] / best["s2s_mean_deg"], 1.0)
+    if "rate_hz" in report:
+        least("* rate_hz, gaze on the wire, device time", report["rate_hz"], RATE_HZ)
+        least("* rate: seconds streamed", report["seconds"], 3.0 if report["quick"] else 59.9)
+        most("* late slots and frames", report["late"], 0)
+        most("* lost frames", report["lost"], 0)
+        most("* truth error of the model over the full process's", report["truth_ratio"], TRUTH_RATIO)
+        least("* n_vectors", report["n_vectors"], VECTORS_AIM, "aim")
+        most("* latency_mean_ms, from the mean sample time", report["latency_mean_max_ms"], LATENCY_MEAN_MS)
+        most("* latency_last_ms, from the last sample", report["latency_last_max_ms"], LATENCY_LAST_MS)
+        for key, limit in (("s2s_deg", S2S_DEG), ("s2s_250_deg", S2S_250_DEG)):
+            most(f"* {key}, nominal", report[key], limit)
+            for light in ("dim", "bright"):
+                if f"{key}_{light}" in report:
+                    most(f"{key}, {light}", report[f"{key}_{light}"], limit, "aim")
+        for name, limit in RATIO.items():
+            most(f"error_ratio.{name}, each frame", report["error_ratio"][name], limit)
+            most(f"error_ratio_250.{name}, at 250 Hz", report["error_ratio_250"][name], limit)
+            most(f"saturated frames after the first 5, {name}", report["saturated_after"][name], 0)
+        most("step.saturated_frames", report["step"]["saturated_frames"], STEP_SATURATED)
+        most("step.settle_frames", report["step"]["settle_frames"], STEP_SETTLE)
+        most("exposure_shift_deg over RMS-S2S", report["exposure_shift_over_s2s"], 1.0)
+        most("flicker_ratio, over steady light of that size", report["flicker_ratio"], FLICKER)
+    if "irradiance_w_m2" in report:
+        for case, value in report["irradiance_w_m2"].items():
+            most(f"irradiance_w_m2, {case}", value, IRRADIANCE_W_M2)
+        least("margin of every limit of IEC 62471's exempt group", report["margin"], 1.0)
+    if "flash" in report:
+        least("flash to spare, share", report["flash"]["spare"], SPARE)
+    if "stack_free" in report:
+        least("RAM never touched, share", report["stack_free"] / RAM_BYTES, SPARE)
     return rows
 
 

@@ -10,6 +10,8 @@ import csv
 
 import numpy as np
 
+from sparsegaze.errors import SparsegazeError
+
 CYCLES_PER_MS = 16_000.0
 FLOATING = 3
 CHANNELS, SAMPLES = 6, 12
@@ -57,6 +59,8 @@ def latency(path):
     mean, last, sent = cycles_of(read(path))
     first = np.searchsorted(sent, last[:-1], side="right")
     alone = np.searchsorted(sent, last[1:], side="right") - first == 1
+    if not alone.any():
+        raise SparsegazeError("no frame in the virtual Nano's log whose bytes can be told apart", "run it longer")
     ends = sent[first[alone]]
     from_mean = (ends - mean[:-1][alone]) / CYCLES_PER_MS
     from_last = (ends - last[:-1][alone]) / CYCLES_PER_MS
