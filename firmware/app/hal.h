@@ -21,7 +21,8 @@ enum { HAL_CHANNELS = SG_WIRE_CHANNELS };
 struct hal_cycle {
     uint32_t t_us;                      // mean of the six lit mid-exposure times, device time
     uint16_t span_us;                   // from t_us to the last sample of the cycle
-    uint16_t seq;                       // low half of the number of cycles sensed since boot
+    uint16_t seq;                       // low half of the number of frames begun since boot: the frame it belongs to
+    uint8_t left;                       // cycles of this frame still to come; 0: its last
     struct sg_reading reading;
 };
 
@@ -32,7 +33,8 @@ struct hal_timing {
     uint8_t repeats;
     uint8_t wiring;                     // enum sg_wiring
     uint8_t lights;                     // 0: never lit
-    uint8_t probe;                      // 0..5: the only emitter; 255: as wired
+    uint8_t probe;                      // 0..5: the only emitter, which does not sense then; 255: as wired
+    uint8_t sleep;                      // 1: hal_poll() sleeps until the next interrupt when it has nothing to do
 };
 
 // ----------------------------------------------------------------------------------------------------
@@ -61,7 +63,9 @@ uint32_t hal_now_us(void);
 // per cent where two releases would collide: `exposure_cycles` is what was taken. Whole: no cycle sees half of it.
 void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS]);
 
-// Timing from a cycle soon on, clipped to what the port can do: `timing` is what was taken.
+// Timing from a cycle soon on, clipped to what the port can do: `timing` is what was taken. A frame begins with
+// it. Pauses that the port cannot make (some hundred cycles) become longer or shorter cycles. Exposures are
+// clipped as by hal_expose().
 void hal_set_timing(struct hal_timing *timing);
 // Longest exposure of a channel under this timing, cycles.
 uint16_t hal_exposure_most(uint8_t channel);
@@ -87,8 +91,11 @@ const uint8_t *hal_slot(uint8_t slot);
 uint8_t hal_load(void *record, uint8_t n);
 uint8_t hal_save(const void *record, uint8_t n);
 
-// Fill in the port's part: late_frames (app_on_cycle returned after the next cycle was complete, or was never
-// called), late_slots (releases later than the reading can state), rx_overrun, stack_free, reset_cause,
+// The port's bits of sg_status.alarm, at little cost.
+uint8_t hal_alarm(void);
+
+// Fill in the port's part: frames, late_frames (app_on_cycle returned after the next cycle was complete, or was never
+// called), late_slots (cycles given up because interrupts were blocked), rx_overrun, stack_free, reset_cause,
 // eeprom_writes, supply_mv, cycles_max, and its bits of alarm.
 void hal_report(struct sg_status *status);
 

@@ -6,9 +6,9 @@
 #include <avr/io.h>
 
 enum {
-    HAL_TRIAL_BYTES = 880,      // 256 + 48 * 13: 48 vectors, beside >= 300 B of stack in 2 KiB
+    HAL_TRIAL_BYTES = 640,      // small models; a tenth of 2 KiB stays free
     HAL_SLOT_SPACE = 1,         // SG_ROM_FLASH: slots are read through LPM
-    HAL_RECORD_MAX = 28,        // live state
+    HAL_RECORD_MAX = 56,        // live state
 };
 
 // Sections for exact cycle counts (tests/budget.csv): GPIOR0 = 2k+1 begins, 2k+2 ends section k. Two cycles

@@ -4,7 +4,8 @@
 
 #include <avr/wdt.h>
 
-static struct hal_frame frame;
+static struct hal_cycle cycle;
+static uint8_t alive;
 
 void hal_describe(struct sg_hello *hello)
 {
@@ -12,9 +13,9 @@ void hal_describe(struct sg_hello *hello)
     hello->slot_base[0] = SLOT_A;
     hello->slot_base[1] = SLOT_B;
     hello->cpu_hz = F_CPU;
-    hello->frame_period_us = HAL_CHANNELS * (SLOT_CYCLES / CYCLES_PER_US);
+    hello->frame_period_us = SLOTS * SLOT_CYCLES_MIN / CYCLES_PER_US;
     hello->exposure_min_us = EXPOSURE_MIN_CYCLES / CYCLES_PER_US;
-    hello->exposure_max_us = EXPOSURE_MAX_CYCLES / CYCLES_PER_US;
+    hello->exposure_max_us = (3 * SLOT_CYCLES_MAX - EXPOSURE_LESS_CYCLES) / CYCLES_PER_US;
     hello->page_bytes = SPM_PAGESIZE;
     hello->board = SG_BOARD_NANO328P;
 }
@@ -26,23 +27,40 @@ const uint8_t *hal_slot(uint8_t slot)
     return (const uint8_t *)(slot == SG_SLOT_A ? (uint16_t)SLOT_A : (uint16_t)SLOT_B);
 }
 
-void hal_start(const uint16_t exposure_cycles[HAL_CHANNELS])
+void hal_start(struct hal_timing *timing, uint16_t exposure_cycles[HAL_CHANNELS])
 {
     serial_start();
-    sense_start(exposure_cycles);
+    sense_start(timing, exposure_cycles);
     boot_watchdog_on();
+    sei();
+}
+
+static void sleep_if_idle(void)
+{
+    cli();
+    if (sense_idle() && serial_idle()) {
+        SMCR = 1 << SE;         // idle: timers, converter and serial line go on
+        sei();                  // takes effect after the next instruction: no interrupt is slept through
+        __asm__ volatile("sleep");
+        SMCR = 0;
+    }
     sei();
 }
 
 int hal_poll(void)
 {
-    if (sense_take(&frame)) {
-        wdt_reset();        // a frame proves the engine, and being here proves the loop
-        app_on_frame(&frame);
+    if (sense_take(&cycle)) {
+        app_on_cycle(&cycle);
         sense_taken();
     }
+    if (alive != sense_alive()) {
+        alive = sense_alive();
+        wdt_reset();            // the engine is alive, and being here proves the loop
+    }
+    sense_poll();
     serial_poll();
     store_poll();
+    sleep_if_idle();
     return 1;
 }
 

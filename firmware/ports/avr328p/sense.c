@@ -1,312 +1,84 @@
 // SPDX-License-Identifier: Apache-2.0
-// The sensing engine: LED i senses while the other five emit, six slots of 640 us a frame, all in interrupts.
-//
-//   slot + 0       OCR1A   the other five light; ~5 us later the charged cathode is released, the release
-//                          instant is read from TCNT1, and OCR1B is set to release + exposure
-//   + exposure     OCR1B   hardware starts the ADC; sample-and-hold closes 132 cycles later. No code involved
-//   + 1 cycle      OCR1A   lights out: its interrupt came earlier and waited. The next LED's cathode is driven
-//                          high, the ADC goes free-running
-//   + 46 us        ADC     first code; three more follow every 52 us, of the same charge: the cathode floats on
-//   + 202 us       ADC     fourth code: their sum is the reading, noise of the ADC and of its reference halved;
-//                          a throw-away conversion of the next channel charges the sample capacitor to Vcc
-//                          through that channel's cathode
-// An interrupt that comes late moves the release and, with it, the sample: never the exposure. Where other
-// light than ours goes on discharging the cathode between the codes, or ours went out late, the first code
-// alone counts.
-//
-// The charge is always done before the next light. In cycles of a slot of 10240, at the longest exposure and
-// with bytes back to back both ways:
-//     145   to the light: its interrupt waits for another to end (none comes before it), then its entry
-//      80   settling
-//    4864   the exposure
-//    3232   to the end of the fourth code: 11.5 ADC clocks of 64, then 3 * 13. Free-running: no code involved
-//     605   its interrupt waits: it comes after the UART's two, which take 120 of every 160 cycles then
-//      95   its entry
-//     896   up to 64 until the ADC's prescaler turns, 13 ADC clocks
-//    9917   in all: 323 (20 us) to spare
-#include "port.h"
-#include "port_serial.h"
+// The sensing engine as the main loop sees it: what to sense next (exposures, timing, lights), what was sensed, and
+// the pauses between frames. The cycles themselves run in sense_isr.c after the plans of plan.c.
+#include "port_sense.h"
+
+#include <string.h>
 
 enum {
-    LED_FIRST_ANODE = 2,            // anodes on PD2..PD7, cathodes on PC0..PC5
-    PORTD_DARK = 1 << PD0,          // pull-up on the UART's input
-    DDRD_ALL = 0xFC,
-    DDRC_ALL = 0x3F,
-    READS = 4,
-    // TCNT1 = OCR1B to the closing of sample-and-hold: the flag rises one cycle after the match, three cycles
-    // go into synchronisation (datasheet, ADC auto triggering), then two ADC clocks of 64 cycles.
-    SAMPLE_CYCLES = 1 + 3 + 2 * 64,
-    // Release (the OUT to PORTC) to the TCNT1 value that the LDS after it returns.
-    RELEASE_READ_CYCLES = 1,
-    EXPOSURE_FIXED_CYCLES = SAMPLE_CYCLES + RELEASE_READ_CYCLES,
-    // Lights-out against TCNT1 = OCR1B, and how much earlier its interrupt is asked for: 75 for another that
-    // may be running, 80 until it looks at the timer, and the shortest wait.
-    DARK_CYCLES = SAMPLE_CYCLES + 1,
-    DARK_AHEAD_CYCLES = 176,
-    DARK_FIXED_CYCLES = 10,         // from the look at the timer to the end of OUT, without the waiting
-    DARK_WAIT_LEAST = 20,           // to the look
-    // Fall of the code from the first to the last, mean of 16 frames, 1/16 LSB: above, or no longer above,
-    // what leakage does. Room light on a nominal LED is 10 codes.
-    OTHER_LIGHT_Q4 = 5 * 16,
-    NO_OTHER_LIGHT_Q4 = 4 * 16,
-    SETTLE_CYCLES = 5 * CYCLES_PER_US - 50,     // 50: from the light to the release without the delay
-    LATE_CYCLES = 40 * CYCLES_PER_US,
-    SOON_CYCLES = 64,               // a compare value nearer than this may be missed
-    WAIT_CYCLES = 60 * CYCLES_PER_US,
-    ADC_ON = (1 << ADEN) | (1 << ADPS2) | (1 << ADPS1),         // 250 kHz
-    ADC_ARMED = ADC_ON | (1 << ADATE) | (1 << ADIE) | (1 << ADIF),
-    // ADSC does nothing while a conversion runs; it starts the one that did not because lights_out() came
-    // after the first code.
-    ADC_AGAIN = ADC_ON | (1 << ADATE) | (1 << ADIE) | (1 << ADSC),
-    ADC_LAST = ADC_ON | (1 << ADIE) | (1 << ADSC),
-    ADC_PRECHARGE = ADC_ON | (1 << ADSC),
-    ADMUX_AVCC = 1 << REFS0,
-    START_BY_COMPARE_B = (1 << ADTS2) | (1 << ADTS0),           // ADCSRB
-    START_BY_ITSELF = 0,
-};
-_Static_assert(EXPOSURE_MIN_CYCLES > EXPOSURE_FIXED_CYCLES + SOON_CYCLES, "the trigger must lie ahead");
-_Static_assert((5 + 6) * CYCLES_PER_US + EXPOSURE_MAX_CYCLES < SLOT_CYCLES / 2, "lit at most half");
-
-struct slot {
-    uint16_t release;               // TCNT1
-    uint16_t exposure_cycles;
-    uint16_t code_q2;
+    WAIT_AT = 120,                  // compare match of EVENT_WAIT after that of the service before it
+    PAUSE_LEAST_SLOTS = 3,
+    RESTART_CYCLES = 600,           // before a frame that begins out of turn
+    PAUSE_CHUNK_CYCLES = 0x8000,    // waited for at once
+    PAUSE_WHOLE_CYCLES = 0xC000,
+    LOCKOUT_WRAPS = LOCKOUT_MS * (F_CPU / 1000) / 65536 + 1,
+    HELD_LEAST = 9,                 // code: what is below is an offset of the converter, not a voltage
+    SUPPLY_CYCLES_LOG2 = 10,        // looked at once in so many cycles
+    SUPPLY_FIRST = 16,
+    SUPPLY_TRIES = 8,
+    SUPPLY_CODE_LEAST = 130,        // 4.2 V at a bandgap of 1.2 V,
+    SUPPLY_CODE_MOST = 235,         // 5.7 V at 1.0 V: beyond, nothing or something else is on the pin
+    SUPPLY_MV_PER_CODE_Q8 = 6875,   // 1.1 V / 1024 / 0.04
 };
 
-struct raw_frame {
-    struct slot slot[HAL_CHANNELS];
-    uint32_t overflows;             // of TCNT1, at the first release
-    uint16_t seq;
-};
+static struct taken ring[2] = { { .other = &ring[1] }, { .other = &ring[0] } };
 
-static struct raw_frame buffer[2];
-static struct slot *filling;                    // slot of the frame being sensed
-static uint8_t filling_buffer;
-static volatile uint8_t ready;                  // 1 + index of a complete frame; 0: none
-static uint8_t led;                             // sensing now
-static uint8_t exposing;                        // between release and sample
-static uint8_t reads;                           // codes in the sum so far
-static uint16_t first_code;
-static uint16_t fall_q4[HAL_CHANNELS];          // first code to last, mean
-static uint8_t first_only;                      // bits of LEDs that other light falls on
-static uint8_t dark_late;                       // the lights were on beyond the sample
-static uint16_t dark;                           // TCNT1 at which they go out
-static uint8_t charging;                        // all codes are read, the next channel's charge has begun
-static uint16_t slot_start;                     // TCNT1 at which the slot's light goes on
-static uint16_t trigger_cycles[HAL_CHANNELS];   // release to OCR1B
-static volatile uint32_t overflows;
-static volatile uint32_t frames;
-static volatile uint16_t late_frames;
+uint8_t sense_gap[GAP_BYTES];
+const uint8_t *volatile sense_list_next;
+uint16_t *sense_out;
+uint16_t sense_slot;
+uint16_t sense_base;
+volatile uint32_t sense_wraps;
+uint8_t sense_left, sense_last;
+uint16_t sense_seq;
+uint8_t sense_drop;
+uint8_t sense_pause;
+volatile uint8_t sense_current;
+volatile uint8_t sense_done;
+
+static volatile uint8_t alive;
+static volatile uint8_t plan_next;          // index of the plan to begin with, or to go on with
+static volatile uint8_t restart;            // timing changed: begin a frame with it
+static uint8_t pausing;
+static uint32_t pause_left;
+static uint32_t pause_cycles;               // between frames; 0: none
 static volatile uint16_t late_slots;
 
-static const uint8_t led_bit[HAL_CHANNELS] = { 1, 2, 4, 8, 16, 32 };
+static struct hal_timing timing;            // asked for
+static uint16_t exposure[HAL_CHANNELS];     // asked for, clipped
+static uint16_t slot;                       // of `timing`
+static uint8_t timing_new, plan_new;        // asked for and not in a plan yet
+static uint8_t locked_out;
+static uint8_t took;                        // cycles taken, low byte
+static uint16_t late_frames;
+static uint32_t frames;
+static uint32_t taken_ticks;
+static uint16_t cycles_max;
+static uint16_t cycles;                     // taken, low half
+static uint8_t supply_tries;                // left of this look at the supply
+static uint8_t supply_code, supply_boot;    // 0: unknown
 
-ISR(TIMER1_OVF_vect)
+// Call with interrupts off.
+static uint32_t wraps_at(uint16_t ticks)
 {
-    overflows++;
+    return sense_wraps + (ticks < sense_base);
 }
 
-// Call with interrupts off. The overflow that came after interrupts went off is pending, not counted.
-static uint32_t overflows_at(uint16_t ticks)
+static void base_at(uint16_t ticks)
 {
-    return overflows + ((TIFR1 & (1 << TOV1)) && ticks < 0x8000U);
+    sense_wraps = wraps_at(ticks);
+    sense_base = ticks;
 }
 
-static inline __attribute__((always_inline)) void light_and_release(void)
+static uint32_t ticks_now(void)
 {
-    const uint8_t bit = led_bit[led];
-    PORTD = PORTD_DARK | (uint8_t)(DDRD_ALL & ~(bit << LED_FIRST_ANODE));
-
-    const uint16_t now = TCNT1;
-    if ((uint16_t)(now - slot_start) > LATE_CYCLES)
-        late_slots++;
-    TIFR1 = 1 << OCF1B;             // the trigger is an edge of this flag: it must be down
-    ADCSRB = START_BY_COMPARE_B;
-    ADCSRA = ADC_ARMED;
-    const uint16_t trigger = trigger_cycles[led];
-    const uint8_t ddrc = DDRC_ALL & ~bit;
-    if (UCSR0A & (1 << RXC0))
-        serial_receive();               // this interrupt takes as long as two bytes
-    else
-        __builtin_avr_delay_cycles(SETTLE_CYCLES);
-
-    // The pull-up is on for the one cycle between the two: the node is at Vcc anyway.
-    uint16_t release;
-    __asm__ volatile("out %[ddr], %[mask]" "\n\t"
-                     "out %[port], __zero_reg__" "\n\t"
-                     "lds %A[ticks], %[low]" "\n\t"
-                     "lds %B[ticks], %[high]"
-                     : [ticks] "=&r"(release)
-                     : [ddr] "I"(_SFR_IO_ADDR(DDRC)), [port] "I"(_SFR_IO_ADDR(PORTC)), [mask] "r"(ddrc),
-                       [low] "i"(_SFR_MEM_ADDR(TCNT1L)), [high] "i"(_SFR_MEM_ADDR(TCNT1H)));
-    const uint16_t match = release + trigger;
-    OCR1B = match;
-    dark = match + DARK_CYCLES;
-    OCR1A = match + (DARK_CYCLES - DARK_AHEAD_CYCLES);
-    exposing = 1;
-    charging = 0;
-    reads = 0;
-
-    filling->release = release;
-    filling->code_q2 = 0;
-    filling->exposure_cycles = trigger + EXPOSURE_FIXED_CYCLES;
-    if (led == 0) {
-        GPIOR1 = 1;
-        buffer[filling_buffer].overflows = overflows_at(release);
+    uint32_t high;
+    uint16_t ticks;
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+        ticks = TCNT1;
+        high = wraps_at(ticks);
     }
-}
-
-// The next slot that many cycles after this one; at once if that has passed, because a compare value in the
-// past would wait for the timer's next turn.
-static inline __attribute__((always_inline)) void next_slot_after(uint16_t cycles)
-{
-    uint16_t start = slot_start + cycles;
-    const uint16_t soonest = TCNT1 + SOON_CYCLES;
-    if ((int16_t)(start - soonest) < 0) {
-        start = soonest;
-        late_slots++;
-    }
-    slot_start = start;
-    OCR1A = start;
-}
-
-// Waits for the cycle: bits 0 and 1 of what is left, then turns of four cycles.
-static inline __attribute__((always_inline)) void lights_out_at(uint16_t cycle)
-{
-    const uint16_t left = cycle - TCNT1;
-    uint8_t wait = (uint8_t)cycle - DARK_FIXED_CYCLES;
-    uint8_t now;
-    dark_late = left < DARK_FIXED_CYCLES + DARK_WAIT_LEAST || left > DARK_AHEAD_CYCLES;
-    if (dark_late) {
-        PORTD = PORTD_DARK;
-        return;
-    }
-    __asm__ volatile("lds %[now], %[low]" "\n\t"
-                     "sub %[wait], %[now]" "\n\t"
-                     "sbrc %[wait], 0" "\n\t"
-                     "rjmp .+0" "\n\t"
-                     "sbrc %[wait], 1" "\n\t"
-                     "rjmp .+0" "\n\t"
-                     "sbrc %[wait], 1" "\n\t"
-                     "rjmp .+0" "\n\t"
-                     "lsr %[wait]" "\n\t"
-                     "lsr %[wait]" "\n\t"
-                     "1: nop" "\n\t"
-                     "dec %[wait]" "\n\t"
-                     "brne 1b" "\n\t"
-                     "out %[port], %[off]"
-                     : [wait] "+r"(wait), [now] "=&r"(now)
-                     : [low] "i"(_SFR_MEM_ADDR(TCNT1L)), [port] "I"(_SFR_IO_ADDR(PORTD)),
-                       [off] "r"((uint8_t)PORTD_DARK));
-}
-
-static inline __attribute__((always_inline)) void lights_out(void)
-{
-    lights_out_at(dark);
-    ADCSRB = START_BY_ITSELF;       // once the conversion under way has ended
-    PORTC = led == HAL_CHANNELS - 1 ? 1 : (uint8_t)(led_bit[led] << 1);
-    exposing = 0;
-
-    next_slot_after(SLOT_CYCLES);
-}
-
-ISR(TIMER1_COMPA_vect)
-{
-    HAL_BEGIN(HAL_SECTION_SENSE);
-    if (exposing) {
-        lights_out();
-    } else if (!charging || (ADCSRA & (1 << ADSC))) {
-        // Only when interrupts were late by 20 us: the codes are not read, or the sample capacitor not charged
-        // yet.
-        late_slots++;
-        next_slot_after(WAIT_CYCLES);
-    } else {
-        light_and_release();
-    }
-    HAL_END(HAL_SECTION_SENSE);
-}
-
-ISR(ADC_vect)
-{
-    HAL_BEGIN(HAL_SECTION_SENSE);
-    const uint16_t code = ADC;
-    filling->code_q2 += code;
-    if (reads++ == 0)
-        first_code = code;
-    if (reads < READS) {
-        ADCSRA = reads < READS - 1 ? ADC_AGAIN : ADC_LAST;
-        HAL_END(HAL_SECTION_SENSE);
-        return;
-    }
-    DDRC = DDRC_ALL;                // floats no longer
-    ADMUX = led == HAL_CHANNELS - 1 ? ADMUX_AVCC : ADMUX_AVCC + 1 + led;
-    ADCSRA = ADC_PRECHARGE;
-    charging = 1;
-
-    const uint8_t bit = led_bit[led];
-    uint16_t fall = fall_q4[led];
-    fall -= fall >> 4;
-    if (code < first_code)
-        fall += first_code - code;
-    fall_q4[led] = fall;
-    if (fall > OTHER_LIGHT_Q4)
-        first_only |= bit;
-    else if (fall < NO_OTHER_LIGHT_Q4)
-        first_only &= (uint8_t)~bit;
-    if (dark_late || (first_only & bit))
-        filling->code_q2 = 4 * first_code;
-    filling++;
-    if (++led == HAL_CHANNELS) {
-        GPIOR1 = 2;
-        led = 0;
-        buffer[filling_buffer].seq = (uint16_t)frames++;
-        if (ready)
-            late_frames++;      // the one that waited was never taken
-        ready = 1 + filling_buffer;
-        filling_buffer = !filling_buffer;
-        filling = buffer[filling_buffer].slot;
-    }
-    HAL_END(HAL_SECTION_SENSE);
-}
-
-void hal_expose(const uint16_t exposure_cycles[HAL_CHANNELS])
-{
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-        uint16_t cycles = exposure_cycles[i];
-        if (cycles < EXPOSURE_MIN_CYCLES)
-            cycles = EXPOSURE_MIN_CYCLES;
-        if (cycles > EXPOSURE_MAX_CYCLES)
-            cycles = EXPOSURE_MAX_CYCLES;
-        cycles -= EXPOSURE_FIXED_CYCLES;
-        ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
-            trigger_cycles[i] = cycles;
-        }
-    }
-}
-
-void sense_start(const uint16_t exposure_cycles[HAL_CHANNELS])
-{
-    hal_expose(exposure_cycles);
-    PORTD = PORTD_DARK;
-    DDRD = DDRD_ALL;
-    DDRC = DDRC_ALL;
-    PORTC = led_bit[0];
-    DIDR0 = DDRC_ALL;               // the cathodes are analog
-
-    filling = buffer[0].slot;
-    ADMUX = ADMUX_AVCC;
-    ADCSRB = START_BY_ITSELF;
-    ADCSRA = ADC_PRECHARGE;
-    charging = 1;
-
-    TCCR1A = 0;
-    TCCR1B = 0;
-    TCNT1 = 0;
-    slot_start = SLOT_CYCLES;       // the first conversion takes 25 ADC clocks, 100 us
-    OCR1A = SLOT_CYCLES;
-    TIFR1 = (1 << TOV1) | (1 << OCF1A) | (1 << OCF1B);
-    TIMSK1 = (1 << OCIE1A) | (1 << TOIE1);
-    TCCR1B = 1 << CS10;
+    return high << 16 | ticks;
 }
 
 uint32_t hal_now_us(void)
@@ -315,59 +87,339 @@ uint32_t hal_now_us(void)
     uint16_t ticks;
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
         ticks = TCNT1;
-        high = overflows_at(ticks);
+        high = wraps_at(ticks);
     }
-    return (high << 12) | (ticks >> 4);
+    return high << 12 | ticks >> 4;
 }
 
-uint8_t sense_take(struct hal_frame *frame)
+static struct taken *filling(void)
 {
-    uint8_t which;
-    uint16_t last = 0;
-    uint32_t sum_cycles = 0;
+    return sense_out < ring[1].code ? &ring[0] : &ring[1];
+}
 
-    ATOMIC_BLOCK(ATOMIC_FORCEON) {
-        which = ready;
-        ready = 0;
+// A frame whose first cycle's hold is at `hold`, by TCNT1.
+static const uint8_t *begin_at(uint16_t hold)
+{
+    const struct plan *plan = &sense_plan[plan_next];
+    pausing = 0;
+    if (restart) {
+        restart = 0;
+        if (sense_left != sense_last)
+            sense_seq++;            // the one under way is cut short
+        sense_last = timing.repeats - 1;
+        sense_left = sense_last;
+        sense_slot = plan->slot_cycles;
+        sense_pause = pause_cycles != 0;
+        const uint16_t second = sense_slot - HOLD_AT + SERVICE_AT;
+        sense_gap[0] = (uint8_t)second;
+        sense_gap[1] = EVENT_DARK_STORE >> 8 | second >> 8;
+        sense_gap[2] = ADMUX_GROUND;
+        sense_gap[3] = WAIT_AT;
+        sense_gap[4] = EVENT_COMPLETE >> 8;
+        sense_gap[5] = ADMUX_GROUND;
     }
-    if (!which)
+    // As if another cycle had gone before: a conversion of GND, the next trigger a slot later, nothing of it kept.
+    OCR1B = hold - HOLD_AT;
+    TIFR1 = 1 << OCF1B;
+    ADMUX = ADMUX_GROUND;
+    OCR1A = hold;
+    sense_drop = 1;
+    sense_out = &filling()->code[CODES - 2];
+    sense_list_next = sense_pause && sense_left == 0 ? sense_gap : plan->event;
+    return plan->event;
+}
+
+const uint8_t *sense_wait(void)
+{
+    const uint16_t match = OCR1A;
+    base_at(match);
+    alive++;
+    if (!pausing) {
+        pausing = 1;
+        pause_left = pause_cycles - (sense_slot - HOLD_AT + SERVICE_AT + WAIT_AT);
+    }
+    if (restart)
+        pause_left = RESTART_CYCLES;
+    if (pause_left > PAUSE_WHOLE_CYCLES) {
+        pause_left -= PAUSE_CHUNK_CYCLES;
+        OCR1A = match + PAUSE_CHUNK_CYCLES;
+        return &sense_gap[GAP_WAIT_AT];
+    }
+    return begin_at(match + (uint16_t)pause_left);
+}
+
+const uint8_t *sense_give_up(void)
+{
+    const uint16_t now = TCNT1;
+    base_at(now);
+    late_slots++;
+    if (sense_left != sense_last) {
+        sense_seq++;
+        sense_left = sense_last;
+    }
+    const uint8_t *list = begin_at(now + RESTART_CYCLES);
+    TIFR1 = 1 << OCF1A;
+    return list;
+}
+
+void sense_late(uint8_t channels, uint8_t cycles, uint8_t kind)
+{
+    const uint8_t unlit = (kind & EVENT_UNLIT >> 8) != 0;
+    struct taken *into = filling();
+    // The first lit releases of a cycle may come before the last codes of the one before.
+    const uint8_t early = sense_out > &into->code[CODES - 3] && !unlit;
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++, channels >>= 1) {
+        if (!(channels & 1))
+            continue;
+        const uint8_t first = i == plan_channel(timing.wiring, 0, 0) || i == plan_channel(timing.wiring, 0, 1);
+        (early && first ? into->other : into)->late[unlit][i] = cycles;
+    }
+}
+
+// ------------------------------------------------------------------------------------------------------
+
+uint16_t hal_exposure_most(uint8_t channel)
+{
+    return plan_exposure_most(channel, timing.wiring, slot);
+}
+
+void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS])
+{
+    plan_clip(exposure_cycles, timing.wiring, slot);
+    memcpy(exposure, exposure_cycles, sizeof exposure);
+    plan_new = 1;
+}
+
+// Cycles per slot that make frames of `frame` cycles without a pause, to the nearest, without a division.
+static uint16_t slot_for(uint32_t frame, uint8_t repeats)
+{
+    const uint16_t step = SLOTS * repeats;
+    uint16_t n = SLOT_CYCLES_MIN;
+    for (uint32_t at = (uint32_t)step * SLOT_CYCLES_MIN + step / 2; at <= frame && n < SLOT_CYCLES_MAX; at += step)
+        n++;
+    return n;
+}
+
+static uint32_t pause_of(const struct hal_timing *t, uint16_t slot_cycles)
+{
+    const uint32_t sensing = (uint32_t)(SLOTS * t->repeats) * slot_cycles;
+    return t->frame_cycles > sensing ? t->frame_cycles - sensing : 0;
+}
+
+void hal_set_timing(struct hal_timing *t)
+{
+    if (t->repeats < 1)
+        t->repeats = 1;
+    if (t->repeats > SG_LIGHT_REPEATS_MAX)
+        t->repeats = SG_LIGHT_REPEATS_MAX;
+    uint16_t n = slot_for(t->period_cycles, 1);
+    uint32_t pause = pause_of(t, n);
+    if (pause < PAUSE_LEAST_SLOTS * n) {
+        if (t->frame_cycles)
+            n = slot_for(t->frame_cycles, t->repeats);
+        while ((pause = pause_of(t, n)) >= SLOTS * (uint16_t)t->repeats && pause < PAUSE_LEAST_SLOTS * n)
+            n--;                    // cycles cannot be that long: shorter ones, and a pause
+        if (pause < PAUSE_LEAST_SLOTS * n)
+            pause = 0;
+    }
+    t->period_cycles = SLOTS * n;
+    if (t->frame_cycles || pause)
+        t->frame_cycles = (uint32_t)t->repeats * t->period_cycles + pause;
+    timing = *t;
+    slot = n;
+    plan_clip(exposure, t->wiring, n);
+    timing_new = 1;
+    plan_new = 1;
+}
+
+static void write_plan(uint8_t index)
+{
+    struct hal_timing lit = timing;
+    struct plan *plan = &sense_plan[index];
+    if (locked_out)
+        lit.lights = 0;
+    memcpy(plan->exposure_cycles, exposure, sizeof exposure);
+    plan->slot_cycles = slot;
+    plan_write(plan, &lit);
+    if (supply_tries)
+        *plan->first_mux = ADMUX_SUPPLY;
+}
+
+void sense_poll(void)
+{
+    if (locked_out && sense_wraps >= LOCKOUT_WRAPS) {
+        locked_out = 0;
+        plan_new = 1;
+    }
+    // The other plan is free once a cycle that follows this one is complete up to the last that did not.
+    if (!plan_new || sense_current != plan_next || sense_done != took)
+        return;
+    const uint8_t index = !plan_next;
+    write_plan(index);
+    plan_new = 0;
+    ATOMIC_BLOCK(ATOMIC_FORCEON) {
+        plan_next = index;
+        if (timing_new) {
+            timing_new = 0;
+            pause_cycles = pause_of(&timing, slot);
+            restart = 1;
+            sense_list_next = sense_gap;
+        } else if (sense_list_next != sense_gap) {
+            sense_list_next = sense_plan[index].event;
+        }
+    }
+}
+
+void sense_start(struct hal_timing *t, uint16_t exposure_cycles[HAL_CHANNELS])
+{
+    locked_out = (boot_reset_cause() & SG_RESET_WATCHDOG) != 0;
+    memcpy(exposure, exposure_cycles, sizeof exposure);
+    hal_set_timing(t);
+    memcpy(exposure_cycles, exposure, sizeof exposure);
+    write_plan(0);
+    plan_new = 0;
+    timing_new = 0;
+    pause_cycles = pause_of(&timing, slot);
+    restart = 1;
+    sense_gap[GAP_WAIT_AT + 1] = EVENT_WAIT >> 8;
+    sense_out = ring[0].code;
+
+    PORTC = 0;
+    PORTD = PORTD_DARK;
+    DDRC = PORTC_ALL;
+    if (timing.wiring == SG_WIRING_PHOTODIODES)
+        DDRD = 7 << FIRST_EMITTER;
+    DIDR0 = PORTC_ALL;
+    ADCSRB = (1 << ADTS2) | (1 << ADTS0);           // Timer1 compare B
+    ADCSRA = (1 << ADEN) | (1 << ADATE) | (1 << ADPS2) | (1 << ADPS1);      // 250 kHz
+    TCCR0B = 0;
+    TCCR1A = 0;
+    TCCR1B = 0;
+    TCNT1 = 0;
+    const uint8_t *list = begin_at(4 * slot);       // the converter's first result takes 25 of its clocks
+    OCR0A = (uint8_t)(uint16_t)list;
+    OCR0B = (uint16_t)list >> 8;
+    TIFR1 = 1 << OCF1A;
+    TIMSK1 = 1 << OCIE1A;
+    TCCR1B = 1 << CS10;
+}
+
+// ------------------------------------------------------------------------------------------------------
+
+static void convert_first(uint8_t admux)
+{
+    for (uint8_t i = 0; i < 2; i++)
+        if (sense_plan[i].first_mux)
+            *sense_plan[i].first_mux = admux;
+}
+
+// Once a second the first GND slot converts the divider at A7 instead, until a code of it has come or too many have
+// not.
+static void look_at_supply(uint16_t held_code)
+{
+    if ((++cycles & ((1 << SUPPLY_CYCLES_LOG2) - 1)) == SUPPLY_FIRST) {
+        supply_tries = SUPPLY_TRIES;
+        convert_first(ADMUX_SUPPLY);
+    } else if (supply_tries) {
+        if (held_code == 0 && --supply_tries)
+            return;
+        supply_tries = 0;
+        convert_first(ADMUX_GROUND);
+        supply_code = 0;
+        if (held_code >= SUPPLY_CODE_LEAST && held_code <= SUPPLY_CODE_MOST)
+            supply_code = (uint8_t)held_code;
+        if (!supply_boot)
+            supply_boot = supply_code;
+    }
+}
+
+uint8_t sense_alive(void)
+{
+    return sense_done + alive;
+}
+
+uint8_t sense_take(struct hal_cycle *cycle)
+{
+    struct taken *from;
+    uint8_t done;
+    uint32_t wraps;
+    uint16_t half_sum = 0;
+    ATOMIC_BLOCK(ATOMIC_FORCEON) {
+        done = sense_done;
+        from = filling()->other;
+        wraps = sense_wraps;
+    }
+    if (done == took)
         return 0;
     HAL_BEGIN(HAL_SECTION_FRAME);
-    // Read without a lock: should the other buffer become complete meanwhile, the engine comes back to this
-    // one with the next release, 90 us later at the earliest.
-    const struct raw_frame *raw = &buffer[which - 1];
-    const uint16_t first = raw->slot[0].release;
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-        const uint16_t exposure_cycles = raw->slot[i].exposure_cycles;
-        frame->code_q2[i] = raw->slot[i].code_q2;
-        frame->exposure_cycles[i] = exposure_cycles;
-        last = raw->slot[i].release - first;
-        sum_cycles += last + (exposure_cycles >> 1);
-    }
-    last += frame->exposure_cycles[HAL_CHANNELS - 1];
-    frame->seq = raw->seq;
-    // sum / 6, as (sum / 2) * 21846 / 2^16: at most two cycles too much for frames below 4096 us, and 32 bits
-    // hold it.
-    const uint16_t mean = (uint16_t)(((sum_cycles >> 1) * 21846UL) >> 16);
-    const uint32_t first_us = (raw->overflows << 12) | (first >> 4);
-    frame->t_us = first_us + ((mean + (first & 15U) + 8U) >> 4);
-    frame->span_us = (uint16_t)(last - mean + 8U) >> 4;
+    taken_ticks = ticks_now();
+    late_frames += (uint8_t)(done - took - 1);
+    took = done;
+
+    // Read without a lock: the interrupt comes back to this one when the other is complete.
+    const struct plan *plan = &sense_plan[from->plan];
+    struct sg_reading *reading = &cycle->reading;
+    const uint16_t *code = &from->code[1];
+    for (uint8_t phase = 0; phase < 3; phase++, code += 4)
+        for (uint8_t k = 0; k < 2; k++) {
+            const uint8_t i = plan_channel(timing.wiring, phase, k);
+            reading->lit_code[i] = code[k];
+            reading->unlit_code[i] = code[2 + k];
+        }
+    memcpy(reading->exposure_cycles, plan->exposure_cycles, sizeof reading->exposure_cycles);
+    memcpy(reading->late_lit_cycles, from->late[0], sizeof from->late[0]);
+    memcpy(reading->late_unlit_cycles, from->late[1], sizeof from->late[1]);
+    memset(from->late, 0, sizeof from->late);
+    reading->held_code = from->code[0] < HELD_LEAST ? 0 : from->code[0];
+    look_at_supply(reading->held_code);
+
+    // Mean of the mid-exposures: slots 1, 2, 7, 8, 13, 14 are 7.5 on average; sum / 12 as sum * 5461 / 2^16.
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+        half_sum += plan->exposure_cycles[i];
+    half_sum = (uint16_t)((uint32_t)half_sum * 5461U >> 16);
+    const uint16_t n = plan->slot_cycles;
+    const uint16_t from_end = (uint16_t)(10 * n + (n >> 1)) - SAMPLE_CYCLES + half_sum;
+    wraps -= (uint8_t)((uint8_t)wraps - from->wraps);
+    const uint32_t end_us = wraps << 12 | from->end >> 4;
+    cycle->t_us = end_us - ((from_end - (from->end & 15U) + 8U) >> 4);
+    cycle->span_us = (uint16_t)(9 * n + (n >> 1) + half_sum + 8U) >> 4;
+    cycle->seq = from->seq;
+    cycle->left = from->left;
+    frames += (uint16_t)(from->seq - (uint16_t)frames);
     return 1;
 }
 
 void sense_taken(void)
 {
-    ATOMIC_BLOCK(ATOMIC_FORCEON) {
-        late_frames += ready != 0;
-    }
+    const uint32_t spent = ticks_now() - taken_ticks;
+    if (spent > cycles_max)
+        cycles_max = spent > UINT16_MAX ? UINT16_MAX : (uint16_t)spent;
+    late_frames += sense_done != took;
     HAL_END(HAL_SECTION_FRAME);
+}
+
+uint8_t sense_idle(void)
+{
+    return timing.sleep && sense_done == took;
+}
+
+uint8_t hal_alarm(void)
+{
+    uint8_t alarm = locked_out ? SG_ALARM_LOCKOUT : 0;
+    const uint8_t moved = supply_code > supply_boot ? supply_code - supply_boot : supply_boot - supply_code;
+    if (supply_code && 25 * (uint16_t)moved > supply_boot)
+        alarm |= SG_ALARM_SUPPLY;
+    return alarm;
 }
 
 void sense_report(struct sg_status *status)
 {
+    status->frames = frames;
+    status->late_frames = late_frames;
+    status->cycles_max = cycles_max;
+    status->supply_mv = (uint16_t)((uint32_t)supply_code * SUPPLY_MV_PER_CODE_Q8 >> 8);
+    status->alarm |= hal_alarm();
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
-        status->frames = frames;
         status->late_slots = late_slots;
-        status->late_frames = late_frames;
     }
 }

@@ -181,6 +181,11 @@ uint8_t serial_poll(void)
     return 1;
 }
 
+uint8_t serial_idle(void)
+{
+    return rx_tail == rx_head && !after_pending;
+}
+
 uint16_t serial_overruns(void)
 {
     uint16_t n;

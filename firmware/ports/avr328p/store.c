@@ -7,7 +7,13 @@
 
 #include <avr/eeprom.h>
 
-enum { TAIL_BYTES = 4, SIZE_V1 = 24, PLACE_V2 = 2 * (SIZE_V1 + TAIL_BYTES) };
+enum {
+    TAIL_BYTES = 4,
+    SIZE_V1 = 24,
+    SIZE_V2 = 28,
+    PLACE_V2 = 2 * (SIZE_V1 + TAIL_BYTES),
+    PLACE_V3 = PLACE_V2 + 2 * (SIZE_V2 + TAIL_BYTES),
+};
 
 // Being written: the record where it lies, and its tail.
 static const uint8_t *payload;
@@ -22,7 +28,7 @@ static uint16_t writes;
 static uint16_t place(uint8_t which, uint8_t n)
 {
     const uint8_t copy_bytes = n + TAIL_BYTES;
-    return (n == SIZE_V1 ? 0 : PLACE_V2) + (which ? copy_bytes : 0);
+    return (n == SIZE_V1 ? 0 : n == SIZE_V2 ? PLACE_V2 : PLACE_V3) + (which ? copy_bytes : 0);
 }
 
 // 1 if the copy is whole; *found is then its sequence number.
