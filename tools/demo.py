@@ -108,7 +108,7 @@ def run(options):
             validation = validate.measure(device, screen_for(device), plan, csv=out / "gaze.csv", progress=progress)
             nano.control.frames(None)
             sections, counters = nano.control.markers(), nano.control.counters()
-            hello, status = device.hello, device.status()
+            status, period_us, limit_hz = device.status(), *timing(device)
     measured = validation.report()
     process = calibration.fit.gp.predict(validation.run.frames["features"].astype(float))
     gp_deg = np.asarray(process[0] if isinstance(process, tuple) else process)
@@ -116,6 +116,7 @@ def run(options):
     accuracy["data_loss"] = accuracy.pop("data_loss_percent") / 100.0
     accuracy.update(with_held_frames(validation))
     inside = validation.run.target_index >= 0
+    measured["stream"]["limit_hz"] = limit_hz
     measured["stream"]["wall_seconds"] = float(np.ptp(validation.run.frames["host_s"][inside]))
     infer, frame = sections[SECTION_INFER], sections[SECTION_FRAME]
     model = calibration.fit.model
@@ -132,10 +133,11 @@ def run(options):
         "inference": {"cycles": sections[SECTION_INFER + "n"].most, "cycles_mean": sections[SECTION_INFER + "n"].mean,
                       "cycles_with_interrupts": infer.most},
         "frame": {"cycles": sections[SECTION_FRAME + "n"].most, "cycles_mean": sections[SECTION_FRAME + "n"].mean,
-                  "cycles_with_interrupts": frame.most, "period_cycles": hello.frame_period_us * CPU_MHZ},
-        "latency_ms": latency(latency_log, hello, status), "counters": counters,
+                  "cycles_with_interrupts": frame.most, "period_cycles": period_us * CPU_MHZ},
+        "latency_ms": latency(latency_log, validation.run.frames, validation.run.offset_us), "counters": counters,
         "device": {key: calibrate.plain(getattr(status, key)) for key in
-                   ("late_frames", "late_slots", "tx_dropped", "rx_bad", "rx_overrun", "saturated", "starved", "stack_free")},
+                   ("late_frames", "late_slots", "tx_dropped", "rx_bad", "rx_overrun", "saturated", "starved", "stack_free",
+                    "fault", "alarm", "supply_mv", "cycles_max")},
         "notes": measured["notes"],
     }
     return report, calibration, validation
@@ -152,45 +154,49 @@ def with_held_frames(validation):
             "data_loss_without_hold": 1.0 - error.frames / max(1, int(validation.settled.sum()))}
 
 
+def timing(device):
+    """(frame period in us, rate in Hz that the device calls its limit) while it streams as it did."""
+    device.set_stream(raw=True, gaze=True)
+    now = device.settings()
+    device.set_stream()
+    return now.frame_period_us, now.rate_limit_hz
+
+
 def model_crc(device):
     """CRC-32 of the model the device uses, computed afresh on the device over its flash; 0 without one."""
     info = device.model_info()
     return 0 if info.active == lib.SG_SLOT_NONE else device.verify(info.active).crc
 
 
-def latency(path, hello, status):
+def latency(path, frames, offset_us):
     """Mean sample time, and last sample, to the last byte's stop bit of the gaze frame; ms of device time.
 
-    path    the virtual Nano's log of cycles: first release of a sensing frame, its last sample read, delimiters sent
-    hello, status   of the device: frame period and exposures, which say when in a frame the samples were taken
-    Of a frame's two packets the gaze goes first, so its last byte is the first delimiter after the samples were read.
+    path        the virtual Nano's log of cycles, of which the ends of sent packets are used (event "delimiter")
+    frames      record array of session.FRAME: t_us is a frame's mean sample time, its last sample span_us later, and
+                its inference was done infer_us after that; the first packet then is the gaze, the second the features
+    offset_us   device time minus the virtual Nano's time
+    Frames with anything else on the line, such as the answer to a ping, are left out.
     """
     with open(path, newline="", encoding="ascii") as file:
-        rows = [(row["event"], int(row["cycle"])) for row in csv.DictReader(file)]
-    release, read, sent = (np.array([cycle for event, cycle in rows if event == name])
-                           for name in ("release", "sample", "delimiter"))
-    exposure = np.array(status.exposure_us_q2) / 4.0 * CPU_MHZ
-    slot = hello.frame_period_us / 6.0 * CPU_MHZ * np.arange(6)
-    last, mean = slot[-1] + exposure[-1], float(np.mean(slot + exposure / 2))
-    ends = []
-    for begin, end in zip(read[:-1], read[1:]):
-        packets = sent[(sent > begin) & (sent <= end)]
-        first = release[release < begin]
-        if len(packets) == 2 and len(first):        # a frame with both packets and nothing else on the line
-            ends.append(packets[0] - first[-1])
-    if not ends:
+        sent = np.array([int(row["cycle"]) for row in csv.DictReader(file) if row["event"] == "delimiter"], np.int64)
+    frames = frames[frames["has_gaze"]]
+    mean = (frames["t_us"] - offset_us) * CPU_MHZ
+    last = mean + frames["span_us"] * CPU_MHZ
+    ready = last + frames["infer_us"] * CPU_MHZ
+    first = np.searchsorted(sent, ready)
+    alone = np.flatnonzero((np.diff(first) == 2) & (np.diff(frames["seq"]) == 1))
+    if not len(alone):
         raise SparsegazeError("the virtual Nano logged no frame whose bytes could be told apart", "run the demo again")
-    ms = 1e-3 / CPU_MHZ
-    return {"frames": len(ends),
-            "mean_sample_to_last_byte": (np.mean(ends) - mean) * ms,
-            "mean_sample_to_last_byte_max": (np.max(ends) - mean) * ms,
-            "last_sample_to_last_byte": (np.mean(ends) - last) * ms,
-            "last_sample_to_last_byte_max": (np.max(ends) - last) * ms}
+    end, ms = sent[first[alone]], 1e-3 / CPU_MHZ
+    from_mean, from_last = (end - mean[alone]) * ms, (end - last[alone]) * ms
+    return {"frames": len(alone),
+            "mean_sample_to_last_byte": from_mean.mean(), "mean_sample_to_last_byte_max": from_mean.max(),
+            "last_sample_to_last_byte": from_last.mean(), "last_sample_to_last_byte_max": from_last.max()}
 
 
 def bars(report):
     """The bars of the demo: [{name, value, bar, met}]."""
-    stream, accuracy, model = report["stream"], report["accuracy"], report["model"]
+    stream, accuracy, model, delay = (report[key] for key in ("stream", "accuracy", "model", "latency_ms"))
     limit = FRESH_S if report["fresh"] else READY_S
     gap = abs(accuracy["mean_deg"] - accuracy["gp64_mean_deg"])
     rows = [
@@ -202,10 +208,16 @@ def bars(report):
         ("stream.seconds", round(stream["seconds"], 2), ">= 20, in real time",
          stream["seconds"] >= 20 and abs(stream["wall_seconds"] / stream["seconds"] - 1) < 0.05),
         ("stream.rate_hz", round(stream["rate_hz"], 2), ">= 250", stream["rate_hz"] >= 250),
+        ("stream.rate_hz of its limit", round(stream["rate_hz"] / stream["limit_hz"], 3), ">= 0.99",
+         stream["rate_hz"] >= 0.99 * stream["limit_hz"]),
         ("stream.lost", stream["lost"] + stream["torn"], "0", stream["lost"] + stream["torn"] == 0),
         ("stream.bit_identical", stream["bit_identical"], "true", stream["bit_identical"] is True),
         ("accuracy.mean_deg", round(accuracy["mean_deg"], 3), "<= 1.0", accuracy["mean_deg"] <= 1.0),
         ("accuracy.data_loss", round(accuracy["data_loss"], 3), f"<= {LOSS_MOST}", accuracy["data_loss"] <= LOSS_MOST),
+        ("latency, mean sample to last byte", round(delay["mean_sample_to_last_byte"], 3), "<= 2.5 ms",
+         delay["mean_sample_to_last_byte"] <= 2.5),
+        ("latency, last sample to last byte", round(delay["last_sample_to_last_byte"], 3), "<= 1.5 ms",
+         delay["last_sample_to_last_byte"] <= 1.5),
         ("|mean_deg - gp64_mean_deg|", round(gap, 4), "<= 0.05", gap <= 0.05),
     ]
     return [{"name": name, "value": value, "bar": bar, "met": bool(met)} for name, value, bar, met in rows]

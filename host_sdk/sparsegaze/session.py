@@ -44,6 +44,7 @@ class FrameLog:
                 frame.host_time,
                 *raw.feature,
                 raw.flags,
+                raw.span_us,
                 raw.model_crc,
                 *raw.recentre.offset_deg_q7,
                 *raw.recentre.gain_q9,
@@ -72,6 +73,7 @@ FRAME_FLAT = np.dtype(
     + [(f"s{i}", "u2") for i in range(6)]
     + [
         ("raw_flags", "u1"),
+        ("span_us", "u2"),
         ("model_crc", "u4"),
         ("recentre_az_q7", "i2"),
         ("recentre_el_q7", "i2"),
@@ -94,6 +96,7 @@ FRAME = np.dtype(
         ("host_s", "f8"),
         ("features", "u2", (6,)),
         ("raw_flags", "u1"),
+        ("span_us", "u2"),
         ("model_crc", "u4"),
         ("recentre", AFFINE),
         ("has_gaze", "?"),
@@ -110,8 +113,8 @@ assert FRAME.itemsize == FRAME_FLAT.itemsize
 class Run:
     """A finished (or cut) run.
 
-    frames          record array [n] of FRAME: seq, t_us, host_s, features, raw_flags, model_crc, recentre,
-                    has_gaze, gaze_q7 (azimuth, elevation in 1/128 deg), gaze_flags, gaze_sigma, infer_us
+    frames          record array [n] of FRAME: seq, t_us, host_s, features, raw_flags, span_us (mean sample
+                    time to last sample), model_crc, recentre, has_gaze, gaze_q7 (azimuth, elevation in 1/128 deg), gaze_flags, gaze_sigma, infer_us
     onset_us        int64 [k], device time at which each target really appeared; k < n_targets when cut
     target_index    int64 [n], which target was up; -1 outside the plan
     lost, torn, bad frames missing by sequence number; with a part missing; with a bad CRC

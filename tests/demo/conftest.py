@@ -19,8 +19,9 @@ GOOD = {
     "stream": {
         "seconds": 25.0,
         "wall_seconds": 25.01,
-        "rate_hz": 260.4,
-        "frames": 6510,
+        "rate_hz": 640.4,
+        "limit_hz": 640,
+        "frames": 16010,
         "lost": 0,
         "torn": 0,
         "differing": 0,
@@ -37,8 +38,13 @@ GOOD = {
         "gp64_mean_deg": 0.71,
     },
     "inference": {"cycles": 15900.0},
-    "frame": {"cycles": 24700.0, "period_cycles": 61440.0},
-    "latency_ms": {"mean_sample_to_last_byte": 4.1, "last_sample_to_last_byte": 2.5},
+    "frame": {"cycles": 22700.0, "period_cycles": 24984.0},
+    "latency_ms": {
+        "mean_sample_to_last_byte": 2.1,
+        "mean_sample_to_last_byte_max": 2.2,
+        "last_sample_to_last_byte": 1.25,
+        "last_sample_to_last_byte_max": 1.3,
+    },
 }
 
 

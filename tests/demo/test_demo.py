@@ -9,11 +9,12 @@ import functools
 import io
 import json
 import sys
-from types import SimpleNamespace
 
 import demo
+import numpy as np
 import pytest
 
+from sparsegaze import session
 from sparsegaze.errors import FlashError, SparsegazeError
 from sparsegaze.mapfile import synthetic_map
 
@@ -24,7 +25,7 @@ stream.seconds stream.rate_hz stream.frames stream.lost stream.bit_identical
 accuracy.mean_deg accuracy.median_deg accuracy.p95_deg accuracy.accuracy_deg accuracy.rms_s2s_deg
 accuracy.data_loss accuracy.to_true_gaze_mean_deg
 accuracy.gp64_mean_deg inference.cycles frame.cycles latency_ms.mean_sample_to_last_byte
-latency_ms.last_sample_to_last_byte
+latency_ms.last_sample_to_last_byte stream.limit_hz
 """.split()
 
 
@@ -47,10 +48,12 @@ def test_a_good_report_meets_every_bar(good):
         ("model.crc_before", "00000000", "model.crc_device"),
         ("stream.seconds", 19.9, "stream.seconds"),
         ("stream.wall_seconds", 12.0, "stream.seconds"),
-        ("stream.rate_hz", 249.9, "stream.rate_hz"),
+        ("stream.limit_hz", 660, "stream.rate_hz of its limit"),
         ("stream.lost", 1, "stream.lost"),
         ("stream.torn", 1, "stream.lost"),
         ("stream.bit_identical", False, "stream.bit_identical"),
+        ("latency_ms.mean_sample_to_last_byte", 2.51, "latency, mean sample to last byte"),
+        ("latency_ms.last_sample_to_last_byte", 1.51, "latency, last sample to last byte"),
         ("accuracy.data_loss", 0.21, "accuracy.data_loss"),
         ("accuracy.gp64_mean_deg", 0.64, "|mean_deg - gp64_mean_deg|"),
         ("accuracy.gp64_mean_deg", 0.76, "|mean_deg - gp64_mean_deg|"),
@@ -61,6 +64,11 @@ def test_each_bar_alone_is_missed_by_its_own_figure(good, key, value, name):
     *path, last = key.split(".")
     (good[path[0]] if path else good)[last] = value
     assert [bar["name"] for bar in demo.bars(good) if not bar["met"]] == [name]
+
+
+def test_a_device_that_can_do_less_than_250_hz_misses_that_bar(good):
+    good["stream"].update(rate_hz=249.9, limit_hz=250)
+    assert [bar["name"] for bar in demo.bars(good) if not bar["met"]] == ["stream.rate_hz"]
 
 
 @pytest.mark.parametrize("mean_deg", [1.001, float("nan")])
@@ -78,43 +86,55 @@ def test_a_fresh_clone_has_ten_minutes(good):
 
 # latency ----------------------------------------------------------------------------------------------------
 
-HELLO = SimpleNamespace(frame_period_us=3840)
-STATUS = SimpleNamespace(exposure_us_q2=[400, 400, 400, 400, 400, 800])  # 100 us, the last 200 us
+FRAME_CYCLES = 24_000
 
 
-def log(path, *events):
-    path.write_text("event,cycle\n" + "".join(f"{event},{cycle}\n" for event, cycle in events))
+def log(path, *packets):
+    rows = "".join(f"adc:3,{cycle - 9}\ndelimiter,{cycle}\n" for cycle in packets)
+    path.write_text("event,cycle\nrelease,5\nsample,9\n" + rows)
     return path
 
 
-def frame(at, first, second):
-    """One frame from cycle `at`: its last sample is read 54400 later, the packets end at +first, +second."""
-    return [("release", at), ("sample", at + 54_400), ("delimiter", at + first), ("delimiter", at + second)]
+def frames_of(n, offset_us=0, lost=()):
+    """n frames 1.5 ms apart: mean sample time 1 ms into each, last sample 0.4 ms later, inference 0.9 ms."""
+    frames = np.zeros(n, session.FRAME)
+    frames["seq"], frames["has_gaze"], frames["span_us"], frames["infer_us"] = np.arange(n), True, 400, 900
+    frames["t_us"] = 1000 + 1500 * np.arange(n) + offset_us
+    return frames[[i for i in range(n) if i not in lost]]
 
 
-def test_latency_counts_from_the_release_to_the_first_packet_after_the_last_sample(tmp_path):
-    events = frame(1000, 80_000, 90_000) + frame(101_000, 80_160, 90_000) + frame(201_000, 80_000, 90_000)
-    found = demo.latency(log(tmp_path / "log.csv", *events), HELLO, STATUS)
-    # The last slot begins 5 * 640 us after the release and is exposed for 200 us; 16 cycles are 1 us.
-    mean_us, last_us = 2.5 * 640 + (5 * 100 + 200) / 12, 5 * 640 + 200
-    assert found["frames"] == 2     # the third has no next sample to end it
-    assert found["last_sample_to_last_byte"] == pytest.approx((5000 + 5 - last_us) / 1000)
-    assert found["last_sample_to_last_byte_max"] == pytest.approx((5000 + 10 - last_us) / 1000)
-    assert found["mean_sample_to_last_byte"] == pytest.approx((5000 + 5 - mean_us) / 1000)
-    assert found["mean_sample_to_last_byte_max"] == pytest.approx((5000 + 10 - mean_us) / 1000)
+def packets_of(n, late=()):
+    """Ends of the gaze's packet 2.5 ms into each frame, 0.01 ms later in `late`; of the features' 0.4 ms later."""
+    ends = []
+    for i in range(n):
+        gaze = 40_000 + FRAME_CYCLES * i + (160 if i in late else 0)
+        ends += [gaze, gaze + 6400]
+    return ends
 
 
-def test_latency_leaves_out_frames_with_another_packet_on_the_line(tmp_path):
-    events = frame(1000, 80_000, 90_000) + frame(101_000, 99_000, 99_500) + [("delimiter", 200_900)]
-    found = demo.latency(log(tmp_path / "log.csv", *events, *frame(201_000, 80_000, 90_000)), HELLO, STATUS)
-    assert found["frames"] == 1
-    assert found["last_sample_to_last_byte"] == found["last_sample_to_last_byte_max"] == pytest.approx(1.6)
+@pytest.mark.parametrize("offset_us", [0, 12_345, -777])
+def test_latency_is_from_the_devices_times_to_the_first_packet_after_the_inference(tmp_path, offset_us):
+    path = log(tmp_path / "log.csv", *packets_of(6, late=[2]))
+    found = demo.latency(path, frames_of(6, offset_us), offset_us)
+    assert found["frames"] == 5     # the last has no next one to end it
+    assert found["mean_sample_to_last_byte"] == pytest.approx(1.5 + 0.01 / 5)
+    assert found["mean_sample_to_last_byte_max"] == pytest.approx(1.51)
+    assert found["last_sample_to_last_byte"] == pytest.approx(1.1 + 0.01 / 5)
+    assert found["last_sample_to_last_byte_max"] == pytest.approx(1.11)
+
+
+def test_latency_leaves_out_frames_with_another_packet_on_the_line_or_that_were_lost(tmp_path):
+    answer = 40_000 + 2 * FRAME_CYCLES - 1000   # of a ping, before the third frame's gaze, which it delays
+    ends = sorted([answer, *packets_of(8)])
+    found = demo.latency(log(tmp_path / "log.csv", *ends), frames_of(8, lost=[5]), 0)
+    assert found["frames"] == 4                 # not the third, the lost one, the one before it, the last
+    assert found["last_sample_to_last_byte_max"] == pytest.approx(1.1)
 
 
 def test_latency_of_a_log_without_a_whole_frame_is_an_error_not_a_number(tmp_path):
-    for events in ([], frame(1000, 80_000, 90_000), [("sample", 5), ("sample", 9)]):
+    for ends in ([], [5, 9], packets_of(1)[:1]):
         with pytest.raises(SparsegazeError, match="no frame"):
-            demo.latency(log(tmp_path / "log.csv", *events), HELLO, STATUS)
+            demo.latency(log(tmp_path / "log.csv", *ends), frames_of(2), 0)
 
 
 # main -------------------------------------------------------------------------------------------------------

@@ -25,9 +25,9 @@ def tool(monkeypatch, tmp_path, good):
 def test_table_shows_the_figures_of_the_report(good):
     table = module.table(good)
     assert "simulated person 1" in table and "**0.70** / 0.60 / 1.50 deg" in table
-    for figure in ("260.4 Hz", "6510, 0, 0", "64 vectors", "15,900, 24,700 of 61,440 cycles"):
+    for figure in ("640.4 Hz", "16010, 0, 0", "64 vectors", "15,900, 22,700 of 24,984 cycles"):
         assert figure in table
-    assert "4.10 ms, 2.50 ms" in table
+    assert "2.10 ms, 1.25 ms" in table
     assert {line.count("|") for line in table.splitlines()} == {4}
 
 

@@ -108,8 +108,8 @@ class FakeBoard(PtyPeer):
         self.hello = dict(firmware=0x000100, slot_bytes=lib.SG_MODEL_SLOT_BYTES, slot_base=[0x6000, 0x6C00],
                           cpu_hz=16000000,
                           wire_version=lib.SG_WIRE_VERSION, model_version=lib.SG_MODEL_VERSION,
-                          frame_period_us=3840,
-                          exposure_min_us=20, exposure_max_us=280, page_bytes=128, trial_bytes=880,
+                          frame_period_us=999,
+                          exposure_min_us=4, exposure_max_us=330, page_bytes=128, trial_bytes=640,
                           board=lib.SG_BOARD_NANO328P, channels=6)
         self.hello.update(hello or {})
         self._decoder = wire.Decoder()
