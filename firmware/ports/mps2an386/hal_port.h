@@ -8,7 +8,7 @@
 enum {
     HAL_TRIAL_BYTES = 3072,     // a whole slot
     HAL_SLOT_SPACE = 0,         // slots are ordinary memory
-    HAL_RECORD_MAX = 32,        // live state
+    HAL_RECORD_MAX = 56,        // live state
 };
 
 // Sections for instruction counts. Each end is reported on the second UART (port.h, struct scope_record).

@@ -5,6 +5,8 @@
 
 #include <stddef.h>
 
+enum { EXPOSURE_MOST_CYCLES = 2544 };
+
 void hal_boot(void)
 {
 }
@@ -15,15 +17,16 @@ void hal_describe(struct sg_hello *hello)
     hello->slot_base[0] = 0;
     hello->slot_base[1] = 0;
     hello->cpu_hz = 16000000;
-    hello->frame_period_us = 3840;
-    hello->exposure_min_us = 16;
-    hello->exposure_max_us = 304;
+    hello->frame_period_us = 999;
+    hello->exposure_min_us = 4;
+    hello->exposure_max_us = EXPOSURE_MOST_CYCLES / 16;
     hello->page_bytes = 0;
     hello->board = SG_BOARD_TEMPLATE;
 }
 
-void hal_start(const uint16_t exposure_cycles[HAL_CHANNELS])
+void hal_start(struct hal_timing *timing, uint16_t exposure_cycles[HAL_CHANNELS])
 {
+    (void)timing;
     (void)exposure_cycles;
 }
 
@@ -37,9 +40,20 @@ uint32_t hal_now_us(void)
     return 0;
 }
 
-void hal_expose(const uint16_t exposure_cycles[HAL_CHANNELS])
+void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS])
 {
     (void)exposure_cycles;
+}
+
+void hal_set_timing(struct hal_timing *timing)
+{
+    (void)timing;
+}
+
+uint16_t hal_exposure_most(uint8_t channel)
+{
+    (void)channel;
+    return EXPOSURE_MOST_CYCLES;
 }
 
 uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_t keep_free)
@@ -73,6 +87,11 @@ uint8_t hal_save(const void *record, uint8_t n)
 {
     (void)record;
     (void)n;
+    return 0;
+}
+
+uint8_t hal_alarm(void)
+{
     return 0;
 }
 

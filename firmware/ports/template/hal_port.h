@@ -4,9 +4,9 @@
 #define HAL_PORT_H
 
 enum {
-    HAL_TRIAL_BYTES = 880,      // RAM for a trial model, bytes
+    HAL_TRIAL_BYTES = 640,      // RAM for a trial model, bytes
     HAL_SLOT_SPACE = 0,         // memory of hal_slot()'s images: 0 ordinary, 1 flash with its own load
-    HAL_RECORD_MAX = 32,        // largest record hal_save() must take, bytes
+    HAL_RECORD_MAX = 56,        // largest record hal_save() must take, bytes
 };
 
 // Sections whose begin and end a port may mark for cycle counts, at no cost if it does not.
