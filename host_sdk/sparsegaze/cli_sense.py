@@ -65,13 +65,18 @@ def settings_report(now):
     }
 
 
-def settings_lines(now, vectors):
-    """A wire.Settings in words; vectors of the model in use, 0: none."""
+def settings_lines(now, vectors, limits):
+    """A wire.Settings in words; vectors of the model in use, 0: none; limits of rate_limits()."""
     with_model = f"the model of {vectors} vectors" if vectors else "no model"
     cycles = "1 cycle" if now.repeats == 1 else f"the mean of {now.repeats} cycles"
     return pairs(
         [
-            ("rate", f"{now.frame_hz:.1f} Hz (at most {now.rate_limit_hz} Hz with {with_model})"),
+            ("rate", f"{now.frame_hz:.1f} Hz of the gaze"),
+            (
+                "at most",
+                f"{limits['gaze']} Hz with {with_model}; {limits['features']} Hz with the features too "
+                f"(stream --csv), {limits['counts']} Hz with --counts",
+            ),
             ("frame", f"{cycles} of {now.period_us} us, every {now.frame_period_us} us"),
             ("wiring", now.wiring_text),
             ("power", now.power_text),
@@ -101,7 +106,8 @@ def settings_lines(now, vectors):
 def settings(port, rate, repeats, power, wiring, rolling, lights, as_json):
     """How the device at PORT senses: frame rate, averaging, power, wiring, lights. Without options: shows it.
 
-    What can be reached depends on the model: the device computes its own limit. Settings survive a restart.
+    What can be reached depends on the model and on what is streamed: the device computes its own limit, and
+    never runs faster. Settings survive a restart.
 
     \b
     Example:
@@ -124,12 +130,25 @@ def settings(port, rate, repeats, power, wiring, rolling, lights, as_json):
         raise click.UsageError("--rolling shows single cycles: it goes with --repeats 1 only")
     with Device(port) as device:
         now, vectors = change(device, port, wanted)
-    Console(as_json).result({**settings_report(now), "n_vectors": vectors}, *settings_lines(now, vectors))
+        limits = rate_limits(device)
+    data = {**settings_report(now), "limits_hz": limits, "n_vectors": vectors}
+    Console(as_json).result(data, *settings_lines(now, vectors, limits))
+
+
+def rate_limits(device):
+    """The rate in Hz that an open device can reach, by what it streams: {"gaze", "features", "counts"}."""
+    limits = {}
+    for name, more in (("gaze", {}), ("features", {"raw": True}), ("counts", {"raw": True, "counts": True})):
+        device.set_stream(gaze=True, **more)
+        limits[name] = device.settings().rate_limit_hz
+    device.set_stream()
+    return limits
 
 
 def change(device, port, wanted):
     """Apply settings to an open device, all or none: (wire.Settings in force, vectors of the model in use).
 
+    Rate and limit are those of a device that streams its gaze, which it does afterwards.
     Raises SparsegazeError naming the limit when the device cannot do what is asked.
     """
     from .errors import DeviceError, SparsegazeError
@@ -138,6 +157,7 @@ def change(device, port, wanted):
 
     info = device.model_info()
     vectors = info.vectors[info.active] if info.active <= lib.SG_SLOT_RAM else 0
+    device.set_stream(gaze=True)
     before, written = device.settings(), device.status().eeprom_writes
     if not wanted:
         return before, vectors

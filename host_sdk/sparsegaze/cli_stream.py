@@ -40,8 +40,8 @@ def stream(port, seconds, csv, counts, baud, as_json):
     recentre_el_deg, recentre_az_az .. el_el (the correction in force), sigma_deg. A gaze whose flags lack
     bit 0 (valid) is no gaze: a blink, a headset that moved, a fault (bit 6).
 
-    At 1 Mbaud the line carries gaze and features of every frame up to 1001 Hz, with --counts up to 700 Hz; at
-    500 kbaud the gaze alone up to 1001 Hz, with --csv up to 720 Hz. The device lowers its rate to what fits.
+    Every frame is sent. Where the line or the chip cannot keep up (--csv adds the features, 40 bytes a frame,
+    --counts 48 more) the device lowers its rate: `sparsegaze settings PORT` shows what fits at which rate.
 
     \b
     Example:

@@ -31,7 +31,7 @@ def checks_of(device, port):
     dark = [fault for fault in found if fault.name in faults.BOARD]
     checks += [Check("lights", False, fault.text, fault.remedy) for fault in dark]
     channels = [fault for fault in found if fault.channel is not None]
-    checks += [Check(f"sensor {fault.channel}", False, fault.text, fault.remedy) for fault in channels]
+    checks += [Check(f"pin A{fault.channel}", False, fault.text, fault.remedy) for fault in channels]
     if not channels:
         checks.append(Check("sensors", True, "all six read"))
     if info.active == lib.SG_SLOT_NONE:

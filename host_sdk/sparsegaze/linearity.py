@@ -32,7 +32,7 @@ STEADY_SHARE = 0.5  # of the short exposures that must be usable
 AMBIENT_MOVE = 0.15  # of our own light: more, and the light was not steady
 GAIN_LEAST = 0.7  # a new curve that leaves more than this share of the shift is not kept
 CURVE_STEPS = 127
-NOMINAL = 0.0675  # the curve that the firmware takes off for every part, to first order
+NOMINAL = 0.05  # the curve that the firmware takes off for every part, to first order
 
 
 class Hold(NamedTuple):

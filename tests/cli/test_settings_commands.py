@@ -15,7 +15,8 @@ def test_settings_shows_what_is_in_force_and_the_limit(command, command_json, fa
     assert data["repeats"] == 1 and data["wiring"] == "leds" and data["power"] == "normal"
     assert data["lights"] is True and data["rolling"] is False
     code, out, _ = command("settings", "PORT")
-    assert code == 0 and "at most 788 Hz with the model of 64 vectors" in out
+    assert code == 0 and "788 Hz with the model of 64 vectors" in out
+    assert data["limits_hz"] == {"gaze": 788, "features": 788, "counts": 788}
 
 
 def test_settings_changes_only_what_was_named_and_waits_until_it_is_stored(command_json, fake):
