@@ -18,7 +18,8 @@ CHANGED = {
     "photocurrent.heat_per_k": (-0.02, {}),
     "node.junction_pf": (50, {}), "node.pin_pf": (9, {}), "node.sample_hold_pf": (10, {}),
     "node.leakage_na": (3, {}), "node.leakage_spread": (0.2, {}),
-    "adc.noise_lsb": (9, {}), "adc.inl_lsb": (20, {}), "adc.offset_lsb": (20, {}), "adc.gain_error": (0.05, {}),
+    "adc.noise_lsb": (9, {}), "adc.inl_lsb": (20, {}), "adc.offset_lsb": (20, {}),
+    "adc.gain_error": (0.05, {}),
     "adc.bandgap_v": (1.3, {}),
     "supply.volts": (4.5, {}), "supply.source_ohm": (5, {}), "supply.ripple_mv": (50, {}),
     "clock.error": (0.1, {"ambient": "bright_room"}),
@@ -123,8 +124,8 @@ def test_lid_follow_gain_reaches_the_simulated_person_and_the_unit_of_light_the_
 def test_map_reference_is_the_mean_that_gives_the_nominal_current(tmp_path, light, na, level, reference,
                                                                   factor):
     keys = {} if reference is None else {"map_reference": reference}
-    with Board(app=firmware("adc"), constants=QUIET, map=uniform_map(tmp_path / "flat.sgmap", level), light=light,
-               **keys) as board:
+    path = uniform_map(tmp_path / "flat.sgmap", level)
+    with Board(app=firmware("adc"), constants=QUIET, map=path, light=light, **keys) as board:
         _, seconds, _, held = exposure(board, lit=0b111110, ticks=1000)
     collected = charge_pc(held, SAMPLER)
     assert collected == pytest.approx(factor * na * 1e-9 * seconds * 1e12, rel=1e-6)

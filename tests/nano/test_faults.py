@@ -127,7 +127,8 @@ def test_opened_while_it_floats_it_keeps_its_voltage(flat_map):
     ("fault 6 open", "LEDs 0..5"), ("fault -1 open", "LEDs 0..5"), ("fault 00 open", "LEDs 0..5"),
     ("fault 0 broken", "fault is none, open"), ("fault 0", "part and a kind"), ("fault", "part and a kind"),
     ("swap 1 1", "two different pins"), ("swap 0 6", "two different pins"), ("swap 0", "two different pins"),
-    ("set fault_7 open", "LEDs 0..5"), ("set fault_ open", "LEDs 0..5"), ("set fault_0 bad", "fault is none")])
+    ("set fault_7 open", "LEDs 0..5"), ("set fault_ open", "LEDs 0..5"),
+    ("set fault_0 bad", "fault is none")])
 def test_what_is_no_fault_is_refused_with_a_reason(line, what):
     with Board(app=firmware("adc"), constants=QUIET) as board:
         answer = board.ask(line)

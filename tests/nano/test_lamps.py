@@ -8,7 +8,7 @@ from scipy.optimize import fsolve
 from board import QUIET, Board, firmware, uniform_map
 from test_leds import DARK, RAIL, SAMPLER, charge_pc, exposure, lit_cycles
 
-ALL, TAPE, TICKS = 0b111110, 32, 1500
+ALL, ON_PORT_D, TICKS = 0b111110, 32, 1500
 
 
 def circuit(lit, supply=5.0, source_ohm=0.5, rail_ohm=0.3, rail=RAIL):
@@ -133,7 +133,7 @@ def test_photodiodes_see_their_emitters_on_d2_to_d4(photodiode_map, emitters):
                map_reference=5.0) as board:
         board.run(1000)
         board.command("counters clear")
-        _, seconds, _, held = exposure(board, lit=emitters << 2, flags=TAPE, ticks=1000)
+        _, seconds, _, held = exposure(board, lit=emitters << 2, flags=ON_PORT_D, ticks=1000)
         seen = board.counters()
     # a map of ones whose nominal mean is that of five emitters: 40 nA each
     expected = 40e-9 * bin(emitters).count("1") * seconds * 1e12
@@ -155,9 +155,9 @@ def test_photodiodes_never_emit_and_are_just_driven(photodiode_map):
 
 def test_other_pins_of_port_d_light_nothing(photodiode_map):
     with Board(app=firmware("adc"), constants=QUIET, map=photodiode_map, wiring="photodiodes") as board:
-        assert exposure(board, lit=0b11100000, flags=TAPE, ticks=1000)[3] == pytest.approx(0, abs=1e-9)
+        assert exposure(board, lit=0b11100000, flags=ON_PORT_D, ticks=1000)[3] == pytest.approx(0, abs=1e-9)
     with Board(app=firmware("adc"), constants=QUIET) as board:
-        exposure(board, lit=0b11111100, flags=TAPE, ticks=1000)         # wiring leds: nothing hangs there
+        exposure(board, lit=0b11111100, flags=ON_PORT_D, ticks=1000)     # wiring leds: nothing there
         assert board.counters()["most_lit"] == 0
 
 
@@ -165,7 +165,7 @@ def test_photodiode_emitters_do_not_load_the_rail(photodiode_map):
     constants = dict(QUIET, **{"supply.source_ohm": 0.5, "rail_ohm": 0.3})
     with Board(app=firmware("adc"), constants=constants, wiring="photodiodes") as board:
         board.run(1000)
-        board.send(b"X" + bytes([0b11100, TAPE]) + (60000).to_bytes(2, "little") + bytes(2))
+        board.send(b"X" + bytes([0b11100, ON_PORT_D]) + (60000).to_bytes(2, "little") + bytes(2))
         board.run(1000)
         on = lamps(board)
     each = 0.020 / (1 + 0.5 * 3 * 0.020 / 3.8)
@@ -193,10 +193,65 @@ def test_impossible_boards_are_refused(key, value, what):
 def test_emitters_of_both_wirings_have_spreads_of_their_own(tmp_path):
     """Each emitter's light by seed, log-normal; sensors the same in both wirings."""
     ratios = []
-    for wiring, lits, flags, emitters in (("leds", (0b10, 0b100), 0, 6), ("photodiodes", (0b100, 0b1000), TAPE, 3)):
+    for wiring, lits, flags, emitters in (("leds", (0b10, 0b100), 0, 6),
+                                          ("photodiodes", (0b100, 0b1000), ON_PORT_D, 3)):
         path = uniform_map(tmp_path / f"{wiring}.sgmap", emitters=emitters)
         constants = dict(QUIET, **{"photocurrent.part_spread": 0.3})
         with Board(app=firmware("adc"), constants=constants, map=path, wiring=wiring) as board:
             light = [charge_pc(exposure(board, lit=lit, flags=flags, ticks=1000)[3], SAMPLER) for lit in lits]
         ratios.append(light[1] / light[0])
     assert all(abs(numpy.log(ratio)) > 1e-3 for ratio in ratios)
+
+
+def currents(flat_map, ticks, count, ripple_mv=50, **keys):
+    """Photocurrents relative to the quiet one, of `count` exposures: the ripple's share of the light."""
+    constants = dict(QUIET, **{"supply.ripple_mv": ripple_mv})
+    with Board(app=firmware("adc"), constants=constants, map=flat_map, **keys) as board:
+        board.command("motion 0")
+        seen = []
+        for _ in range(count):
+            _, seconds, _, held = exposure(board, lit=ALL, ticks=ticks)
+            seen.append(charge_pc(held, SAMPLER) * 1e-3 / seconds / 200)
+    return numpy.array(seen), seconds
+
+
+@pytest.mark.parametrize("ticks", [100, 1400])
+def test_ripple_of_the_supply_is_in_the_light_and_averages_over_ten_microseconds(flat_map, ticks):
+    seen, seconds = currents(flat_map, ticks, 250)
+    # independent draws of 10 us each, of 50 mV in 2 V: the variance of their mean over the exposure, in which
+    # the draws at both ends count in part (its phase against their grid is anything)
+    n = seconds / 10e-6
+    assert n > 2
+    expected = 50e-3 / 2.0 * (1 / n - 1 / (3 * n * n)) ** 0.5
+    assert numpy.std(seen) == pytest.approx(expected, rel=0.15)
+    assert abs(numpy.mean(seen) - 1) < 4 * expected / 250 ** 0.5
+
+
+def test_ripple_repeats_with_the_seed_and_not_otherwise(flat_map):
+    first, again, other = (currents(flat_map, 400, 3, seed=seed)[0] for seed in (4, 4, 5))
+    assert list(first) == list(again) != list(other)
+
+
+def test_ripple_counts_more_where_the_supply_leaves_less(flat_map):
+    spread = []
+    for rail in (1.0, 3.0):
+        seen, _ = currents(flat_map, 400, 120, ripple_mv=20, rail_volts=rail)
+        spread.append(numpy.std(seen / numpy.mean(seen)))
+    assert spread[1] / spread[0] == pytest.approx(2.8 / 0.8, rel=0.02)      # the same draws
+
+
+def test_frame_log_has_the_electrical_moments():
+    with Board(app=firmware("adc"), constants=QUIET) as board:
+        _, seconds, lit_s, _ = exposure(board, lit=0b000110, flags=DARK, ticks=1500, dark=700)
+        sampled = board.node(0)[2]
+        rows = [line.split(",") for line in board.log.read_text().splitlines()[1:]]
+    at = {}
+    for name, cycle in rows:
+        at.setdefault(name, []).append(int(cycle))
+    release, = at["release"]
+    on, off = at["sample"]
+    assert at["lit:6"] == [on - 1] and at["lit:0"] == [off - 1]
+    assert at["drive0:3"] == [release - 1] == [sampled - round(seconds * 16e6)]
+    assert at["drive1:1"] == at["drive2:1"] == at["lit:6"] and at["drive1:0"][-1] == at["lit:0"][0]
+    assert at["adc:0"] == [sampled] and len(at["adc:15"]) == 1
+    assert [int(cycle) for _, cycle in rows] == sorted(int(cycle) for _, cycle in rows)

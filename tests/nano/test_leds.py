@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LEDs as sensors: charging against the closed form and an integrator, charge sharing, rail, ceiling, light."""
+"""LEDs as sensors: charging against closed form and integrator, charge sharing, rail, ceiling, light."""
 
 import struct
 
@@ -60,7 +60,8 @@ def exposure(board, lit=0, flags=0, ticks=1000, dark=0):
 
 def lit_cycles(board):
     """Cycles from lights on to lights out of the last exposure with DARK."""
-    marks = [int(line.split(",")[1]) for line in board.log.read_text().splitlines() if line.startswith("sample")]
+    rows = (line.split(",") for line in board.log.read_text().splitlines())
+    marks = [int(cycle) for name, cycle in rows if name == "sample"]
     return marks[1] - marks[0]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conversions one after another as the firmware makes them: prescaler 64, Timer1 compare B, ground between."""
+"""Conversions one after another as the firmware makes them: prescaler 64, Timer1, ground between."""
 
 import struct
 

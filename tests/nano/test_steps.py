@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changes at exact cycles, in the middle of an exposure: against an integrator of the node under that light."""
+"""Changes at exact cycles, in the middle of an exposure: against an integrator of the node."""
 
 import struct
 
@@ -26,7 +26,7 @@ class Bench:
         return Board(app=firmware("adc"), constants=QUIET, **self.keys)
 
     def expose(self, board, at=()):
-        """Release, sample (cycles) and volts held of one exposure; `at`: (cycle, key, value) set on the way."""
+        """Release and sample (cycles), volts held of an exposure; `at`: (cycle, key, value) set before."""
         board.run(1000)
         board.log = board.folder / "frames.csv"
         board.command(f"frames on {board.log}")
@@ -196,11 +196,14 @@ def test_set_at_clear_forgets():
 
 
 @pytest.mark.parametrize("line,what", [
-    ("set_at", "a cycle, a key"), ("set_at 99999 light", "a cycle, a key"), ("set_at x light dim", "a cycle, a key"),
+    ("set_at", "a cycle, a key"), ("set_at 99999 light", "a cycle, a key"),
+    ("set_at x light dim", "a cycle, a key"),
     ("set_at 5 light dim", "past"), ("set_at 99999999 light dimm", "nominal, dim or bright"),
     ("set_at 99999999 colour red", "the keys are"), ("set ambient_na -1", "0 to 1e+06"),
-    ("set ambient_na nan", "0 to 1e+06"), ("set ambient_flicker 1.1", "0 to 1"), ("set flicker_hz 0", "0.1 to"),
-    ("set supply_volts 4.1", "4.2 to 5.5"), ("set supply_volts 5.6", "4.2 to 5.5"), ("set supply_volts", "a key and"),
+    ("set ambient_na nan", "0 to 1e+06"), ("set ambient_flicker 1.1", "0 to 1"),
+    ("set flicker_hz 0", "0.1 to"),
+    ("set supply_volts 4.1", "4.2 to 5.5"), ("set supply_volts 5.6", "4.2 to 5.5"),
+    ("set supply_volts", "a key and"),
     ("set ambient noon", "dark, room"), ("set lid wide", "or auto"), ("set microsaccades 0.5", "0 to 1"),
     ("counters all", "nothing or clear")])
 def test_what_cannot_be_set_is_refused_with_a_reason(line, what):

@@ -15,7 +15,8 @@ struct charge_node {
     double rail_volts;
 };
 
-// Illuminated, the junction stops at a forward voltage: where there is one, V is never above rail_volts + this.
+// Illuminated, the junction stops at a forward voltage: where there is one, V is never above the rail plus
+// this.
 extern const double CHARGE_CEILING_VOLTS;
 
 // volts <= rail_volts + CHARGE_CEILING_VOLTS where there is a junction.

@@ -245,8 +245,8 @@ static void do_fault(struct call *c)
 static void do_swap(struct call *c)
 {
     uint64_t a, b;
-    if (c->words != 3 || !whole(c->word[1], &a) || !whole(c->word[2], &b) || a >= LEDS_COUNT || b >= LEDS_COUNT
-        || a == b) {
+    if (c->words != 3 || !whole(c->word[1], &a) || !whole(c->word[2], &b) || a >= LEDS_COUNT
+        || b >= LEDS_COUNT || a == b) {
         say(c, "err swap takes two different pins, 0..5");
         return;
     }

@@ -7,11 +7,13 @@
 #include "adc.h"
 #include "noise.h"
 
-static const char *const DRIVE_NAMES[LEDS_COUNT] = {"drive0", "drive1", "drive2", "drive3", "drive4", "drive5"};
+static const char *const DRIVE_NAMES[LEDS_COUNT] = {
+    "drive0", "drive1", "drive2", "drive3", "drive4", "drive5"
+};
 enum { EMITTER_PIN = 2 };
 static const double PULLUP_OHM = 35e3, DRIVER_OHM = 25;    // of a port pin: datasheet, pin pull-up and driver
 static const double LEAKAGE_DOUBLES_K = 10;                // comment of physics.toml, [node]
-static const double DIVIDER = 0.04;                        // 240k and 10k, with a capacitor: stiff
+static const double DIVIDER = 0.04;                        // 240k and 10k: stiff for the sampler
 static const double COVERED = 0.01, FINGER_LIGHT = 5, FINGER_AMBIENT = 0.1;
 
 static struct led_part *part_of(struct leds *l, int pin)
@@ -62,7 +64,8 @@ static double stiff_volts(struct leds *l, int i, uint64_t cycle, double supply_n
         return 0;
     if (l->led[i].drive == LED_HIGH) {
         bool loaded = !l->wiring->photodiodes && fault != FAULT_OPEN;
-        return lamps_supply_at(&l->lamps, cycle) - (loaded ? DRIVER_OHM * l->lamps.amperes : 0) + supply_noise;
+        double drop = loaded ? DRIVER_OHM * l->lamps.amperes : 0;
+        return lamps_supply_at(&l->lamps, cycle) - drop + supply_noise;
     }
     return fault == FAULT_SHORT ? l->lamps.rail_volts + noise_volts : 0;
 }
@@ -204,13 +207,15 @@ static struct lamps_on emitters_on(struct leds *l)
     struct lamps_on on = {0, 0, 0};
     if (l->wiring->photodiodes) {
         for (int i = 0; i < LEDS_EMITTERS; i++)
-            if (l->pins.port_d & l->pins.ddr_d & 1 << (EMITTER_PIN + i) && l->part[LEDS_COUNT + i].fault != FAULT_OPEN)
+            if (l->pins.port_d & l->pins.ddr_d & 1 << (EMITTER_PIN + i)
+                && l->part[LEDS_COUNT + i].fault != FAULT_OPEN)
                 on.lit |= (uint8_t)(1 << i);
         return on;
     }
     for (int i = 0; i < LEDS_COUNT; i++) {
         enum led_fault fault = part_of(l, i)->fault;
-        uint8_t *which = fault == FAULT_SHORT ? &on.shorted : fault == FAULT_SHORT_GROUND ? &on.grounded : &on.lit;
+        uint8_t *which = fault == FAULT_SHORT ? &on.shorted
+                       : fault == FAULT_SHORT_GROUND ? &on.grounded : &on.lit;
         if (drive_of(l, i) == LED_HIGH && fault != FAULT_OPEN)
             *which |= (uint8_t)(1 << i);
     }

@@ -71,8 +71,8 @@ static void after_reset(struct nano *nano, enum nano_reset cause)
     nano->reset_flags = cause == NANO_RESET_POWER ? NANO_RESET_POWER : nano->reset_flags | (uint8_t)cause;
     avr->data[MCUSR] = nano->reset_flags;
     avr->run_cycle_limit = BATCH_CYCLES;
-    // INT0 and INT1 may be on pins that are driven. Left alone, the stock module looks at such a pin every cycle while it
-    // is low, once more for every time it became low.
+    // INT0 and INT1 may be on pins that are driven. Left alone, the stock module looks at such a pin every
+    // cycle while it is low, once more for every time it became low.
     avr_extint_set_strict_lvl_trig(avr, 0, 0);
     avr_extint_set_strict_lvl_trig(avr, 1, 0);
     timer1_reset(&nano->timer1);

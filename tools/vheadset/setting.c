@@ -20,7 +20,8 @@ static const struct { const char *name; double low, high; } NUMBERS[] = {
     [KEY_FLICKER_HZ] = {"flicker_hz", 0.1, 1e4}, [KEY_LID] = {"lid", 0, 1},
     [KEY_MICROSACCADES] = {"microsaccades", 0, 1}, [KEY_PUPIL] = {"pupil_mean_mm", 1.5, 8},
     [KEY_SUPPLY] = {"supply_volts", 4.2, 5.5}, [KEY_WARMER] = {"warmer_k", -60, 60},
-    [KEY_SLIP_X] = {"slip_x", -20, 20}, [KEY_SLIP_Y] = {"slip_y", -20, 20}, [KEY_SLIP_Z] = {"slip_z", -20, 20},
+    [KEY_SLIP_X] = {"slip_x", -20, 20}, [KEY_SLIP_Y] = {"slip_y", -20, 20},
+    [KEY_SLIP_Z] = {"slip_z", -20, 20},
 };
 
 static bool real(const char *text, double low, double high, double *out)
@@ -33,7 +34,8 @@ static bool real(const char *text, double low, double high, double *out)
     return true;
 }
 
-static const char *parse_fault(const struct nano *nano, const char *part, const char *kind, struct setting *out)
+static const char *parse_fault(const struct nano *nano, const char *part, const char *kind,
+                               struct setting *out)
 {
     static const char *const kinds[] = {"none", "open", "short", "short_ground", "covered", "finger", NULL};
     int parts = nano->config.wiring.photodiodes ? LEDS_PARTS : LEDS_COUNT, i = part[0] - '0', k = 0;
@@ -104,7 +106,9 @@ void setting_apply(struct nano *nano, const struct setting *s, uint64_t cycle)
     case KEY_PUPIL: person->pupil_mean_mm = s->number; break;
     case KEY_SUPPLY: lamps_set_supply(&leds->lamps, s->number, cycle); break;
     case KEY_WARMER: leds->warmer_k = s->number; break;
-    case KEY_SLIP_X: case KEY_SLIP_Y: case KEY_SLIP_Z: person->slip_mm[s->key - KEY_SLIP_X] = s->number; break;
+    case KEY_SLIP_X: case KEY_SLIP_Y: case KEY_SLIP_Z:
+        person->slip_mm[s->key - KEY_SLIP_X] = s->number;
+        break;
     default: leds_set_fault(leds, s->key - KEY_FAULT_0, (enum led_fault)s->number, cycle);
     }
     leds->light.response_known = false;
