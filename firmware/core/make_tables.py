@@ -15,7 +15,7 @@ JUNCTION_V = 0.7          # C(V) = C0 / (1 + V / 0.7 V) ** 0.4
 JUNCTION_POWER = 0.4
 PIN_PF = 6.0
 SAMPLE_HOLD_PF = 14.0
-RAIL_V = 2.5              # what the cathodes rest on
+RAIL_V = 1.8              # what the cathodes rest on
 REFERENCE_V = 1.1
 TIMER_HZ = 16.0e6
 UNIT_A = 62.5e-12         # feature 0
@@ -129,20 +129,22 @@ def light_table():
             '#include <stdint.h>\n\n#include "sg_rom.h"\n\n'
             f"// Feature of 1/{CODE_UNIT} code collected in 1 cycle.\n"
             f"#define UNIT_Q12 {rounded(FEATURE_PER_OCTAVE * math.log2(unit_a / UNIT_A))}L\n\n"
-            "// Curvature of sg_light_loop.c, Q0.16: 2 k1; the same and half a step of x in 3 k2 x; 4 steps of that.\n"
+            "// Curvature of sg_light_loop.c, Q0.16: 2 k1; the same and half a step of x in 3 k2 x; a step of that;\n"
+            "// k2 over 256, as a power of two.\n"
             f"#define TWICE_K1_Q16 {rounded(2 * k1 * 65536)}\n"
             f"#define SG_LIGHT_SLOPE_Q16 {rounded(2 * k1 * 65536 + 3 * k2 * 128)}\n"
-            f"#define SG_LIGHT_CUBIC {rounded(4 * 3 * k2 * 256)}\n\n"
+            f"#define SG_LIGHT_CUBIC {rounded(3 * k2 * 256)}\n"
+            f"#define SG_LIGHT_SQUARE_SHIFT {rounded(math.log2(k2 * 256))}\n\n"
             "// Share of the sample capacitor in the capacitance at rest, Q0.16.\n"
             f"#define SHARE_Q16 {rounded(SAMPLE_HOLD_PF / capacitance_at_rest_pf() * 65536)}\n\n"
-            f"// Weights of earlier unlit codes by period, every {PERIOD_STEP} cycles from {PERIOD_FROM} on: b and\n"
-            "// -c of sg_light.h, Q0.16.\n"
+            f"// Weights of earlier unlit codes by period, nearest of every {PERIOD_STEP} cycles from {PERIOD_FROM}: b and\n"
+            "// -c of sg_light.h, Q0.8.\n"
             f"enum {{ PERIOD_FROM = {PERIOD_FROM}, PERIOD_BITS = {PERIOD_STEP.bit_length() - 1}, "
-            f"PERIOD_MOST = {PERIOD_FROM + PERIOD_STEP * (PERIOD_NODES - 1) - 1} }};\n"
-            f"static const uint16_t before_q16[{PERIOD_NODES}] SG_ROM = {{\n"
-            + rows([rounded(65536 * b) for b, _ in weights]) + "};\n"
-            f"static const uint16_t earlier_minus_q16[{PERIOD_NODES}] SG_ROM = {{\n"
-            + rows([rounded(-65536 * c) for _, c in weights]) + "};\n\n#endif\n")
+            f"PERIOD_NODES = {PERIOD_NODES} }};\n"
+            f"static const uint8_t before_q8[{PERIOD_NODES}] SG_ROM = {{\n"
+            + rows([rounded(256 * b) for b, _ in weights]) + "};\n"
+            f"static const uint8_t earlier_minus_q8[{PERIOD_NODES}] SG_ROM = {{\n"
+            + rows([rounded(-256 * c) for _, c in weights]) + "};\n\n#endif\n")
 
 
 def log2_table():

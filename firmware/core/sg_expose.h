@@ -32,12 +32,19 @@ uint16_t sg_expose_from_us_q4(uint16_t exposure_us_q4);
 struct sg_expose_led {
     uint16_t exposure_cycles;   // in force from soon on; always within the limits
     uint16_t most_cycles;       // the user's limit and the timing's
-    uint8_t unlit_then;         // unlit codes / 4 when the exposure was chosen, and the largest of late
-    uint8_t unlit_peak;
-    uint8_t signal_then;        // lit less unlit, / 4, when it was chosen
-    uint8_t tracking;           // 0: acquiring, every look may correct; 1: only lasting departures do
+    uint8_t unlit_peak;         // unlit code / 4, the largest of late
+    uint8_t unlit_then;         // the same when the exposure was accepted
+    uint8_t signal_then;        // lit less unlit code, / 4, when it was
+    uint8_t stage;              // enum sg_expose_stage
     int8_t streak;              // looks in a row that were too bright (> 0) or too dim (< 0)
-    uint8_t reserved;
+    uint8_t caution;            // eighths taken off the goal since exposures chosen of late were full soon after
+};
+
+enum sg_expose_stage {
+    SG_EXPOSE_ACQUIRE = 0,      // the next sample decides
+    SG_EXPOSE_REFINE = 1,       // so does this one, if it finds much to correct
+    SG_EXPOSE_VERIFY = 2,       // the next sample is taken as the measure
+    SG_EXPOSE_TRACK = 3,        // only what lasts, and what ambient light does
 };
 
 struct sg_expose {
@@ -45,6 +52,8 @@ struct sg_expose {
     uint16_t ambient_peak;      // sum of the unlit codes, the largest of late
     uint8_t fallen;             // cycles in a row that it was less than a sixteenth of that
     uint8_t next;               // channel to look at
+    uint8_t looks;              // rounds of looks, for what is slow
+    uint8_t reserved;
 };
 
 // Begin at these exposures (clipped), with these limits. To hold exposures, start them there and call only
@@ -54,8 +63,9 @@ void sg_expose_start(struct sg_expose *expose, const uint16_t exposure_cycles[6]
 // What the port made of the exposures asked for: it may move them by a few per cent. Call after every change.
 void sg_expose_taken(struct sg_expose *expose, const uint16_t exposure_cycles[6]);
 
-// One cycle: a look at the next channel, and at once at those that saturated; all of them when ambient light fell
-// away, two a cycle.
+// One cycle: a look at the next channel; at once at those that are full (an eighth of the exposure, a sixteenth if
+// the unlit code is full too); at those that are being acquired, two a cycle: after the start, after being full, and
+// when ambient light fell away.
 //
 //   lit_code, unlit_code, exposure_cycles   as in struct sg_reading. A cycle taken with another exposure than the one in
 //                      force says nothing but "saturated"; a pipeline of any depth does not correct twice.

@@ -16,24 +16,16 @@ enum {
 // Pairs in the order of sampling, by wiring: six LEDs, or six photodiodes.
 static const uint8_t order[2][6] SG_ROM = { { 5, 0, 1, 4, 2, 3 }, { 0, 3, 1, 4, 2, 5 } };
 
-// Value of a table at a fraction of 2^bits between two entries.
-static int16_t between(const uint16_t *entry, uint16_t fraction, uint8_t bits)
-{
-    const int32_t here = sg_rom_word(entry), next = sg_rom_word(entry + 1);
-    return (int16_t)(here + (((next - here) * fraction) >> bits));
-}
-
 void sg_light_start(struct sg_light *light, uint8_t wiring, uint16_t period_cycles)
 {
     *light = (struct sg_light) { .wiring = wiring ? 1 : 0 };
-    if (period_cycles < PERIOD_FROM)
-        period_cycles = PERIOD_FROM;
-    if (period_cycles > PERIOD_MOST)
-        period_cycles = PERIOD_MOST;
-    const uint16_t into = (uint16_t)(period_cycles - PERIOD_FROM);
-    const uint16_t node = into >> PERIOD_BITS, fraction = into & ((1U << PERIOD_BITS) - 1U);
-    light->before_q16 = between(&before_q16[node], fraction, PERIOD_BITS);
-    light->earlier_q16 = (int16_t)-between(&earlier_minus_q16[node], fraction, PERIOD_BITS);
+    uint8_t node = 0;
+    if (period_cycles > PERIOD_FROM)
+        node = (uint8_t)((uint16_t)(period_cycles - PERIOD_FROM + (1U << (PERIOD_BITS - 1))) >> PERIOD_BITS);
+    if (node >= PERIOD_NODES)
+        node = PERIOD_NODES - 1;
+    light->before_q8 = sg_rom_byte(&before_q8[node], SG_ROM_FLASH);
+    light->earlier_q8 = sg_rom_byte(&earlier_minus_q8[node], SG_ROM_FLASH);
     for (uint8_t i = 0; i < SG_LIGHT_CHANNELS; i++)
         light->channel[i].slope_q16 = SG_LIGHT_SLOPE_Q16;
 }
@@ -90,7 +82,6 @@ uint8_t sg_light_features(struct sg_light *light, uint16_t feature[6])
             }
             value += sg_light_log2_q12((uint16_t)sum);
             *feature = value < 0 ? 0 : value > UINT16_MAX ? UINT16_MAX : (uint16_t)value;
-            channel->sum_q5 = 0;
             channel->cycles = 0;
         }
         flags |= channel->flags;

@@ -7,7 +7,7 @@
 // while it rests.
 //
 // Charge on a node at V, its junction reverse-biased by the rail less V, its sample capacitor come from V_before:
-//   Q = F(2.5) - F(2.5 - V) + (6 + 14) pF * V - 14 pF * V_before,  F(r) = 40 pF * 0.7/0.6 * (1 + r/0.7)^0.6
+//   Q = F(1.8) - F(1.8 - V) + (6 + 14) pF * V - 14 pF * V_before,  F(r) = 40 pF * 0.7/0.6 * (1 + r/0.7)^0.6
 // In units of a code at 0 V, with x = code / 1024 (make_tables.py fits k1 and k2):
 //   q(code) = code * (1 + (k1 + curve / 1024) * x + k2 * x^2),   signal = q(lit) - q(unlit) - s * (before, the same)
 // The unlit code meant is that of the lit moment, u, three sixths of a phase (18 slots a cycle, 3 of them) before
@@ -57,8 +57,8 @@ struct sg_light_channel {
 
 struct sg_light {
     struct sg_light_channel channel[6];
-    int16_t before_q16;             // b of above
-    int16_t earlier_q16;            // c
+    uint8_t before_q8;              // b of above
+    uint8_t earlier_q8;             // -c
     uint16_t moving;                // mean square of the sum of the unlit codes' departures, 1/64 code^2
     uint8_t wiring;                 // enum sg_wiring
     uint8_t gap;                    // 1: the next cycle does not follow the previous one

@@ -14,6 +14,12 @@ static inline int16_t high(int16_t x, int16_t y)
     return (int16_t)(((int32_t)x * y) >> 16);
 }
 
+// Q0.8 of a difference, rounded down.
+static inline int16_t by_q8(int16_t x, uint8_t weight_q8)
+{
+    return (int16_t)(((int32_t)x * weight_q8) >> 8);
+}
+
 static inline uint16_t size_of(int16_t x)
 {
     return (uint16_t)(x < 0 ? -x : x);
@@ -23,15 +29,16 @@ static inline uint16_t size_of(int16_t x)
 // their difference:  D (2 k1 X + 3 k2 (X^2 + d^2 / 3) + curve X / 512).
 //   slope_q16   2 k1 + curve / 512
 // 65536 X is the sum of both codes. In the small term its upper byte does, which is half a step of 1/256 too small
-// on average: SG_LIGHT_SLOPE_Q16 makes that up. d^2: 3 k2 / 3 is 532/256 of the upper byte of (256 d)^2, taken as 2.
-// Overflow   the bracket is within -0.25 .. 0.36 in Q0.16.
+// on average: SG_LIGHT_SLOPE_Q16 makes that up. d^2 is the
+// upper byte of (256 d)^2 over 256.
+// Overflow   the bracket is within -0.25 .. 0.44 in Q0.16.
 static int16_t bend_q5(uint16_t lit_q5, uint16_t unlit_q5, int16_t slope_q16)
 {
     const int16_t difference = (int16_t)(lit_q5 - unlit_q5);
     const uint16_t sum = (uint16_t)(lit_q5 + unlit_q5);
     const uint8_t x = (uint8_t)(sum >> 8), d = (uint8_t)(size_of(difference) >> 8);
-    const int16_t slope = (int16_t)(slope_q16 + (int16_t)((uint16_t)(x * SG_LIGHT_CUBIC) >> 2));
-    const int16_t bracket = (int16_t)((int16_t)(((int32_t)slope * sum) >> 16) + (int16_t)(((uint16_t)(d * d) >> 8) << 1));
+    const int16_t slope = (int16_t)(slope_q16 + (int16_t)(x * SG_LIGHT_CUBIC));
+    const int16_t bracket = (int16_t)((int16_t)(((int32_t)slope * sum) >> 16) + (int16_t)(((uint16_t)(d * d) >> 8) << SG_LIGHT_SQUARE_SHIFT));
     return high(difference, bracket);
 }
 
@@ -109,7 +116,7 @@ static uint16_t ambient_q5(const struct sg_light *light, struct sg_light_channel
             return unlit_q5;
         }
     }
-    int32_t meant = (int32_t)unlit_q5 + high(past, light->before_q16) + high(long_past, light->earlier_q16);
+    int32_t meant = (int32_t)unlit_q5 + by_q8(past, light->before_q8) - by_q8(long_past, light->earlier_q8);
     if (pass->moving_q8 < SG_LIGHT_MOVING_FULL)
         meant = mean + (((meant - mean) * pass->moving_q8) >> 8);
     return meant < 0 ? 0 : meant > INT16_MAX ? INT16_MAX : (uint16_t)meant;
@@ -120,7 +127,6 @@ static void begin(struct sg_light_channel *channel, uint16_t exposure_cycles, ui
 {
     channel->exposure_cycles = exposure_cycles;
     channel->unit_q12 = (int16_t)(UNIT_Q12 - sg_light_log2_q12(exposure_cycles == 0 ? 1 : exposure_cycles));
-    channel->sum_q5 = 0;
     channel->cycles = 0;
     sg_light_settle(channel, unlit_q5);
 }
@@ -153,7 +159,8 @@ void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint
     const int16_t bend = bend_q5(lit_q5, meant_q5, channel->slope_q16);
     const int16_t brought = high(pass->brought_q5, SHARE_Q16);
     if (channel->cycles != UINT8_MAX) {
-        channel->sum_q5 += (int32_t)difference + (int16_t)(bend + missed - brought);
+        const int32_t signal = (int32_t)difference + (int16_t)(bend + missed - brought);
+        channel->sum_q5 = channel->cycles == 0 ? signal : channel->sum_q5 + signal;
         channel->cycles++;
     }
     pass->brought_q5 = difference;

@@ -8,24 +8,26 @@
 #include "sg_rom.h"
 
 // Feature of 1/32 code collected in 1 cycle.
-#define UNIT_Q12 34767L
+#define UNIT_Q12 35078L
 
-// Curvature of sg_light_loop.c, Q0.16: 2 k1; the same and half a step of x in 3 k2 x; 4 steps of that.
-#define TWICE_K1_Q16 4578
-#define SG_LIGHT_SLOPE_Q16 4581
-#define SG_LIGHT_CUBIC 25
+// Curvature of sg_light_loop.c, Q0.16: 2 k1; the same and half a step of x in 3 k2 x; a step of that;
+// k2 over 256, as a power of two.
+#define TWICE_K1_Q16 5995
+#define SG_LIGHT_SLOPE_Q16 6001
+#define SG_LIGHT_CUBIC 12
+#define SG_LIGHT_SQUARE_SHIFT 2
 
 // Share of the sample capacitor in the capacitance at rest, Q0.16.
-#define SHARE_Q16 21961
+#define SHARE_Q16 20834
 
-// Weights of earlier unlit codes by period, every 2048 cycles from 15984 on: b and
-// -c of sg_light.h, Q0.16.
-enum { PERIOD_FROM = 15984, PERIOD_BITS = 11, PERIOD_MOST = 32367 };
-static const uint16_t before_q16[9] SG_ROM = {
-    19465, 19310, 19135, 18939, 18723, 18485, 18224, 17941, 17634,
+// Weights of earlier unlit codes by period, nearest of every 2048 cycles from 15984: b and
+// -c of sg_light.h, Q0.8.
+enum { PERIOD_FROM = 15984, PERIOD_BITS = 11, PERIOD_NODES = 9 };
+static const uint8_t before_q8[9] SG_ROM = {
+    76, 75, 75, 74, 73, 72, 71, 70, 69,
 };
-static const uint16_t earlier_minus_q16[9] SG_ROM = {
-    4961, 5082, 5222, 5383, 5568, 5780, 6021, 6297, 6612,
+static const uint8_t earlier_minus_q8[9] SG_ROM = {
+    19, 20, 20, 21, 22, 23, 24, 25, 26,
 };
 
 #endif

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sensing chain in float64, independent of the core: photocurrents to ADC codes, and codes to photocurrents.
 
-The charge balance is that of physics.toml's node on a rail of 2.5 V, in closed form; nothing here is a polynomial.
+The charge balance is that of physics.toml's node on a rail of 1.8 V, in closed form; nothing here is a polynomial.
 Currents in nA, charges in pC, exposures in timer cycles of 1/16 us, codes of 1.1 V / 1024.
 """
 import numpy as np
 
 from sparsegaze._core import ffi, lib
 
-RAIL_V, REFERENCE_V = 2.5, 1.1
+RAIL_V, REFERENCE_V = 1.8, 1.1
 JUNCTION_PF, JUNCTION_V, POWER = 40.0, 0.7, 0.4
 PIN_PF, SAMPLE_PF = 6.0, 14.0
 UNIT_NA = 0.0625
