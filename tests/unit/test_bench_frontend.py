@@ -407,3 +407,13 @@ def test_size_reads_an_elf_and_refuses_what_is_none(bench, tmp_path):
         bench.size.size(tmp_path / "x.elf")
     with pytest.raises(SparsegazeError, match="cannot read"):
         bench.size.size(tmp_path / "none.elf")
+
+
+def test_size_counts_what_is_flashed(bench, firmware_elf, firmware_hex):
+    """Bytes of data records of the hex: type 00, their count the first byte."""
+    rows = firmware_hex.read_text().split()
+    flashed = sum(int(row[1:3], 16) for row in rows if row[7:9] == "00")
+    found = bench.size.size(firmware_elf)
+    assert found["flash"]["bytes"] == pytest.approx(flashed, abs=2)
+    assert found["flash"]["spare"] == pytest.approx(1 - (flashed + 4096 + 512) / 32768, abs=1e-3)
+    assert 0 < found["ram"]["bytes"] < 2048
