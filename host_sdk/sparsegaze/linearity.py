@@ -30,7 +30,7 @@ STEP_OCTAVES = 0.015, 0.05  # between two long exposures 80 ms apart: always dri
 STEP_TIMES = 8.0  # between these, this many times the usual
 STEADY_SHARE = 0.5  # of the short exposures that must be usable
 AMBIENT_MOVE = 0.15  # of our own light: more, and the light was not steady
-GAIN_LEAST = 0.7  # a new curve that leaves more than this share of the shift is not kept
+AGAIN_SHARE, AGAIN_CURVE = 0.3, 0.006  # a second measurement must find the curve again this well
 CURVE_STEPS = 127
 NOMINAL = 0.05  # the curve that the firmware takes off for every part, to first order
 
@@ -50,10 +50,12 @@ class Hold(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """curve [6]; shift_octaves [6] of a quarter of the exposure against all of it, with the curve that was in
-    force, and its standard error noise_octaves [6]; used, given: short exposures."""
+    """curve [6]; offset_codes [6] that our light reads too much, whatever the exposure; shift_octaves [6]
+    of a quarter of the exposure against all of it, with the curve that was in force, and its standard error
+    noise_octaves [6]; used, given: short exposures."""
 
     curve: np.ndarray
+    offset_codes: np.ndarray
     shift_octaves: np.ndarray
     noise_octaves: np.ndarray
     used: int
@@ -65,7 +67,7 @@ class Linearity(NamedTuple):
 
     before, after   measured shifts, octaves; noise of each, octaves
     old, curve      the curves before and now; kept: the new ones are stored (False: they were no better)
-    codes           of our light at the automatic exposures
+    codes           of our light at the automatic exposures;  offset_codes  that it reads more than it is
     """
 
     before: np.ndarray
@@ -75,6 +77,7 @@ class Linearity(NamedTuple):
     curve: np.ndarray
     kept: bool
     codes: np.ndarray
+    offset_codes: np.ndarray
 
     def report(self):
         """Plain numbers."""
@@ -88,6 +91,7 @@ class Linearity(NamedTuple):
             "shift_percent_after": percent(self.after),
             "noise_octaves": self.noise,
             "codes": self.codes,
+            "offset_codes": self.offset_codes,
         }
 
 
@@ -123,12 +127,13 @@ def run(device, progress=None):
         check_steady(again)
         second = fit(again, np.array(device.curve().curve))
         noise = np.hypot(first.noise_octaves, second.noise_octaves)
-        size = [np.sqrt(np.mean(shift**2)) for shift in (first.shift_octaves, second.shift_octaves)]
-        kept = bool(size[1] <= max(GAIN_LEAST * size[0], 3 * float(np.sqrt(np.mean(noise**2)))))
+        kept = _confirmed(first, second, old, noise)
         stored = not kept
         codes = np.mean([hold.lit - hold.unlit for hold in holds if hold.full], axis=0)
         now = first.curve if kept else old
-        return Linearity(first.shift_octaves, second.shift_octaves, noise, old, now, kept, codes)
+        return Linearity(
+            first.shift_octaves, second.shift_octaves, noise, old, now, kept, codes, first.offset_codes
+        )
     finally:
         if stored:
             device.curve(old)
@@ -139,6 +144,16 @@ def run(device, progress=None):
         if settings.repeats != 1 or settings.rolling:
             device.settings(repeats=settings.repeats, rolling=settings.rolling)
         device.set_stream()
+
+
+def _confirmed(first, second, old, noise):
+    """True when a second measurement finds the curves again, and no larger a shift under them."""
+
+    def rms(values):
+        return float(np.sqrt(np.mean(np.square(values))))
+
+    again = rms(second.curve - first.curve) <= max(AGAIN_SHARE * rms(first.curve - old), AGAIN_CURVE)
+    return again and rms(second.shift_octaves) <= rms(first.shift_octaves) + 2 * rms(noise)
 
 
 def measure(device, long_us, rounds, say=lambda part: None):
@@ -165,8 +180,10 @@ def measure(device, long_us, rounds, say=lambda part: None):
 def fit(holds, curve):
     """Least-squares curve of every channel from Holds measured with `curve` [6] in force. Returns Fit.
 
-    d = log2 of the short exposure's photocurrent over the long one's, which lies around it. In truth
-    d = g(c; x short) - g(c; x long) is taken off with g = log2(1 + c x), x = (lit + unlit) / 1024 codes.
+    d = log2 of the short exposure's photocurrent over the long one's, which lies around it. The true curve c
+    would have made nothing of it but noise: charge goes by 1 + c x, x = (lit + unlit) / 1024 codes. An unlit
+    code cannot fall below 0, nor say how far below it the converter's zero is: so a constant number of codes,
+    which weighs most in short exposures, is fitted beside c, or c would take it for curvature.
     Raises CalibrationError when too few of the exposures are usable.
     """
     curve = np.asarray(curve, float)
@@ -190,16 +207,19 @@ def fit(holds, curve):
     x = np.array([[(hold.lit + hold.unlit) / 1024 for hold in triple] for triple in triples])
     x_long, x_short = (1 - share) * x[:, 0] + share * x[:, 2], x[:, 1]
     ratio = np.array([b.exposure_us / a.exposure_us for a, b, _ in triples])
-    found, shift, noise = np.zeros(CHANNELS), np.zeros(CHANNELS), np.zeros(CHANNELS)
+    parts = np.array([[1 / np.maximum(hold.lit - hold.unlit, 1.0) for hold in triple] for triple in triples])
+    part = parts[:, 1] - (1 - share) * parts[:, 0] - share * parts[:, 2]
+    found, offset, shift, noise = (np.zeros(CHANNELS) for _ in range(4))
     for i in range(CHANNELS):
         rows = np.flatnonzero(use)
-        found[i] = _curve_of(d[rows, i], x_long[rows, i], x_short[rows, i], curve[i])
+        of_channel = (values[rows, i] for values in (d, x_long, x_short, part))
+        found[i], offset[i] = _curve_of(*of_channel, curve[i])
         quarter = rows[np.abs(ratio[rows, i] - ratio[rows, i].min()) < 0.08]
         values = d[quarter, i]
         shift[i] = np.median(values)
         noise[i] = 1.2533 * 1.4826 * np.median(np.abs(values - shift[i])) / np.sqrt(len(values))
     steps = np.clip(np.round(1024 * found), -CURVE_STEPS, CURVE_STEPS)
-    return Fit(steps / 1024, shift, noise, int(use.sum()), len(use))
+    return Fit(steps / 1024, offset, shift, noise, int(use.sum()), len(use))
 
 
 def check_steady(holds):
@@ -226,17 +246,19 @@ def check_steady(holds):
         )
 
 
-def _curve_of(d, x_long, x_short, old):
-    """The curve that leaves nothing of d [n] over, by Gauss-Newton, outliers weighing less."""
+def _curve_of(d, x_long, x_short, part, old):
+    """(curve, offset in codes) that leave least of d [n], by Gauss-Newton, outliers weighing less."""
     told = np.log2(1 + (NOMINAL + old) * x_short) - np.log2(1 + (NOMINAL + old) * x_long)
-    c = NOMINAL + old
+    c, offset = NOMINAL + old, 0.0
     for _ in range(8):
-        rest = d - told + np.log2(1 + c * x_short) - np.log2(1 + c * x_long)
+        rest = d - told + np.log2(1 + c * x_short) - np.log2(1 + c * x_long) - offset * part / np.log(2)
         slope = (x_short / (1 + c * x_short) - x_long / (1 + c * x_long)) / np.log(2)
         spread = max(1.4826 * float(np.median(np.abs(rest - np.median(rest)))), 1e-5)
-        weight = 1 / np.maximum(1.0, np.abs(rest) / (2 * spread))
-        c = float(np.clip(c - (weight * slope) @ rest / ((weight * slope) @ slope), -0.2, 0.2))
-    return c - NOMINAL
+        weight = np.sqrt(1 / np.maximum(1.0, np.abs(rest) / (2 * spread)))
+        design = np.column_stack([slope, -part / np.log(2)]) * weight[:, None]
+        step = np.linalg.lstsq(design, -rest * weight, rcond=1e-6)[0]
+        c, offset = float(np.clip(c + step[0], NOMINAL - 0.25, NOMINAL + 0.25)), float(offset + step[1])
+    return c - NOMINAL, offset
 
 
 def _settle(device, progress):

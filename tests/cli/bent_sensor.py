@@ -16,14 +16,22 @@ class BentSensor(FakeDevice):
     bend      [6] true curves;  light  of our LEDs, 1: 600 codes in the 50 us of the automatic exposure
     ambient   function t_us -> codes a microsecond that come without our light
     wander    function t_us -> (azimuth, elevation) added to where the eye looks, degrees
+    zero      code of the converter at 0 V
     """
 
     def __init__(
-        self, bend=(0.0,) * 6, light=1.0, ambient=lambda t_us: 0.0, wander=None, code_noise=0.6, **options
+        self,
+        bend=(0.0,) * 6,
+        light=1.0,
+        ambient=lambda t_us: 0.0,
+        wander=None,
+        zero=0.0,
+        code_noise=0.6,
+        **options,
     ):
         super().__init__(noise=0.0, **options)
         self.bend, self.light, self.ambient = np.array(bend, float), light, ambient
-        self.wander, self.code_noise = wander, code_noise
+        self.wander, self.zero, self.code_noise = wander, zero, code_noise
 
     def eye_deg(self, t_us):
         here = super().eye_deg(t_us)
@@ -45,4 +53,4 @@ class BentSensor(FakeDevice):
     def _code(self, charge):
         bend = NOMINAL + self.bend
         code = (np.sqrt(1 + 4 * bend * charge / 1024) - 1) / (2 * bend / 1024)
-        return np.clip(np.round(code + self.rng.normal(0, self.code_noise, 6)), 0, 1023)
+        return np.clip(np.round(code + self.zero + self.rng.normal(0, self.code_noise, 6)), 0, 1023)

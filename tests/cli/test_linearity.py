@@ -39,6 +39,14 @@ def test_finds_every_curve_and_takes_the_shift_away(wander, ambient):
     assert device.automatic and device.stream[-1] == (False, False, False)
 
 
+@pytest.mark.parametrize("zero", [-2.0, 2.0])
+def test_a_converter_whose_zero_is_off_is_not_taken_for_curvature(zero):
+    found = linearity.run(BentSensor(BEND, wander=drift, zero=zero, frame_us=1999))
+    assert found.kept and np.abs(found.curve - BEND).max() < 0.005
+    # In the dark an unlit code stops at 0: what is below is missing from our light.
+    assert np.abs(found.offset_codes - min(zero, 0.0)).max() < 0.6
+
+
 def test_starts_from_the_curve_in_force_and_is_then_content():
     device = BentSensor(BEND, frame_us=1999)
     device.curve(BEND)
