@@ -4,7 +4,7 @@
 import numpy as np
 
 from .errors import ModelError
-from .model import HEAD_BYTES, RECORD_BYTES, SLOT_BYTES
+from .model import HEAD_BYTES, RECORD_BYTES
 from .trust import NODE_BYTES
 from .trustfit import CELLS_MAX
 
@@ -12,8 +12,10 @@ from .trustfit import CELLS_MAX
 # them, the same for every input: those of a model without vectors, and of a vector.
 # tests/unit/test_fit_choice.py holds them against tests/budget.csv.
 CYCLES_BASE, CYCLES_EACH = 2770, 149.5
-MOST = 128  # vectors chosen without being asked for: past this nothing is gained
-ROOM = (SLOT_BYTES - HEAD_BYTES - NODE_BYTES * (CELLS_MAX + 1) ** 2) // RECORD_BYTES  # beside any grid
+NANO_SLOT_BYTES = 2048  # of one of the Nano's two model slots, as its firmware says in HELLO
+CELLS_LEAST = 6  # per axis, of the grid of what to expect: cells of some 7 degrees
+ROOM = (NANO_SLOT_BYTES - HEAD_BYTES - NODE_BYTES * (CELLS_LEAST + 1) ** 2) // RECORD_BYTES
+MOST = 78  # vectors chosen without being asked for: past this nothing is gained, and the grid gets coarser
 AIM_DEG = 0.05  # rms distance to the full process
 LOSS = 1.05  # and the truth error may be this much the full process's
 FINE_DEG = 0.01  # rms distance below which more vectors change nothing: the output has steps of 1/128 deg
@@ -22,6 +24,12 @@ FINE_DEG = 0.01  # rms distance below which more vectors change nothing: the out
 def cycles(vectors):
     """Cycles of an inference on the Nano, features in to gaze out."""
     return int(np.ceil(CYCLES_BASE + CYCLES_EACH * vectors))
+
+
+def cells(vectors):
+    """Cells per axis of the largest grid that a slot of the Nano has room for beside so many vectors."""
+    left = NANO_SLOT_BYTES - HEAD_BYTES - RECORD_BYTES * vectors
+    return int(np.clip(np.sqrt(max(left, 0) // NODE_BYTES) - 1, 1, CELLS_MAX))
 
 
 def most_vectors(budget_cycles=None, n_vectors=None):

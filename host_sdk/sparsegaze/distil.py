@@ -194,15 +194,26 @@ class _Task:
                 )
             offset, gain_q12, centres = self._placed(expansion)
             s, target = self._steps(self.train, offset, gain_q12)
-            made = assemble(s, target, centres, offset, gain_q12, ridge, self._trust(offset, gain_q12))
+            made = assemble(
+                s, target, centres, offset, gain_q12, ridge, self._trust(offset, gain_q12, len(centres))
+            )
             if made:
                 return made
         none = "no number format holds the weights of this model"
         raise CalibrationError(none, "calibrate again with more targets")
 
-    def _trust(self, offset, gain_q12):
+    def _trust(self, offset, gain_q12, vectors):
         gaze = self.gp.predict(self.features)
-        return trustfit.learn(self.features, gaze, self.sigma_deg, offset, gain_q12, self.noise, self.label)
+        return trustfit.learn(
+            self.features,
+            gaze,
+            self.sigma_deg,
+            offset,
+            gain_q12,
+            self.noise,
+            self.label,
+            choose.cells(vectors),
+        )
 
     def _placed(self, expansion):
         """offset, gain_q12 [d], centres [n, d] of all channels; zeros where the process dropped one."""

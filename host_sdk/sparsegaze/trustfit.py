@@ -32,13 +32,14 @@ SIGMA_AT_LIMIT = 2.0  # how many times larger sigma is where a point is refused
 NODE_STEP = 8  # of a guard's projection, per step of an expectation
 
 
-def learn(features, gaze_deg, sigma_deg, offset, gain_q12, noise, label=None):
+def learn(features, gaze_deg, sigma_deg, offset, gain_q12, noise, label=None, cells_max=CELLS_MAX):
     """Trust for a model whose inputs are scaled by offset and gain_q12.
 
     features   [n, d] frames of the calibration, blinks excluded
     gaze_deg   [n, 2] what the process says of those frames (not their targets)
     sigma_deg  [n] standard deviation of each of its angles there;  noise [d] rms of one frame, feature units
     label      int [n] fixation of each frame; None: each its own
+    cells_max  of the grid, per axis: what the slot leaves room for
     Raises CalibrationError for fewer than 4 frames.
     """
     features, gaze = np.asarray(features, float), np.asarray(gaze_deg, float)
@@ -46,7 +47,7 @@ def learn(features, gaze_deg, sigma_deg, offset, gain_q12, noise, label=None):
         raise CalibrationError(f"{len(features)} frames tell nothing of what to expect", "record more targets")
     s, _ = quantise(np.clip(np.rint(features), 0, 65535), offset, gain_q12)
     step = (s >> 4).astype(float)
-    origin, scale, nodes = _grid(gaze)
+    origin, scale, nodes = _grid(gaze, cells_max)
     blend = _shares(gaze, origin, scale, nodes)
     table = _smooth(blend, nodes, np.column_stack([step, np.log2(np.maximum(sigma_deg, 1e-3))]))
     surface, sigma = table[:, :-1], table[:, -1]
@@ -108,11 +109,11 @@ def spread(learnt, gp, fixed, rows, gaze_deg):
     return sigma * float(np.quantile(error[inner] / sigma[inner][:, None], 0.683))
 
 
-def _grid(gaze):
+def _grid(gaze, cells_max):
     """(origin_deg_q7 [2], scale [2], nodes [2]) of a grid over gaze [n, 2]; azimuth, elevation."""
     low, high = np.quantile(gaze, [TAIL, 1 - TAIL], axis=0)
     low, high = np.maximum(low - MARGIN_DEG, -127.0), np.minimum(high + MARGIN_DEG, 127.0)
-    cells = np.clip(np.ceil((high - low) / CELL_DEG), 1, CELLS_MAX).astype(np.int64)
+    cells = np.clip(np.ceil((high - low) / CELL_DEG), 1, cells_max).astype(np.int64)
     scale = np.clip(np.floor(512.0 * cells / (high - low)), 1, 255).astype(np.int64)
     return np.floor(low * 128).astype(np.int64), scale, cells + 1
 
