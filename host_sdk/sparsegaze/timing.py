@@ -18,8 +18,9 @@ SLOT_CYCLES, SLOT_CYCLES_MAX = 888, 1777
 EXPOSURE_SLOTS = (2, 3)  # the longest exposure of a phase's first and second sensor ends this long after
 EXPOSURE_LESS_CYCLES = 120  # the slot before, less these
 LIGHTS_AHEAD_CYCLES = 120  # lights on before the earlier release, at the most
-LATE_CYCLES = 128  # lights out may be as late as the longest other interrupt
-WATCHDOG_MS = 120
+DARK_AFTER_CYCLES = 32  # lights out after the second sample
+LATE_CYCLES = 96  # later by the longest other interrupt, now and then
+WATCHDOG_MS = 128  # 16,384 periods of 128 kHz: what the compiler's library calls 120 ms
 WATCHDOG_SPREAD = 0.10  # its oscillator, part to part and over supply and temperature
 LOCKOUT_MS = 1000  # dark after the watchdog had to reset
 CLOCK_SPREAD = 0.01  # the resonator
@@ -65,7 +66,7 @@ class Timing:
         first, second = (
             min(pair) for pair in zip(self.exposure_cycles or self.longest_exposures, self.longest_exposures)
         )
-        return LIGHTS_AHEAD_CYCLES + max(first + self.slot_cycles, second) + late
+        return LIGHTS_AHEAD_CYCLES + max(first + self.slot_cycles, second) + DARK_AFTER_CYCLES + late
 
     def lit_s(self, late=0):
         """The same in seconds."""

@@ -41,7 +41,9 @@ def test_the_firmware_is_built_with_what_eye_safety_is_computed_from(port, name,
 
 
 def test_the_watchdog_is_set_to_what_eye_safety_is_computed_from(port):
-    assert re.findall(r"wdt_enable\(WDTO_(\d+)MS\)", port).count(str(timing.WATCHDOG_MS)) == 1
+    # Named after the data sheet's "typical 0.125 s", which is 16,384 periods of 128 kHz.
+    assert re.findall(r"wdt_enable\(WDTO_(\d+)MS\)", port).count("120") == 1
+    assert timing.WATCHDOG_MS == 16384 / 128
 
 
 @pytest.mark.parametrize("kind, name", [("leds", "SG_WIRING_LEDS"), ("photodiodes", "SG_WIRING_PHOTODIODES")])
@@ -52,19 +54,19 @@ def test_the_firmware_senses_in_the_phases_of_headset_files(port, kind, name):
 
 
 def test_the_longest_lights_by_the_slots():
-    # At 888 cycles: 120 before the earlier release; the second sensor is exposed for 3 slots less 120.
+    # At 888 cycles: 120 before the earlier release; the second sensor is exposed for 3 slots less 120; 32 after it.
     one = Timing()
     assert one.longest_exposures == (2 * 888 - 120, 3 * 888 - 120)
-    assert one.lit_cycles() == 120 + 3 * 888 - 120
+    assert one.lit_cycles() == 120 + 3 * 888 - 120 + 32
     assert one.period_cycles == 15984 and one.rate_hz == pytest.approx(1001.0, abs=0.01)
-    assert one.phase_duty() == pytest.approx(2664 / 15984)
+    assert one.phase_duty() == pytest.approx(2696 / 15984)
 
 
 def test_short_exposures_light_until_the_second_sample():
     one = Timing(exposure_cycles=(64, 64))
-    assert one.lit_cycles() == 120 + 64 + 888, "the first is released a slot before the second"
-    assert Timing(exposure_cycles=(64, 2000)).lit_cycles() == 120 + 2000
-    assert Timing(exposure_cycles=(1000, 64)).lit_cycles() == 120 + 1000 + 888
+    assert one.lit_cycles() == 120 + 64 + 888 + 32, "the first is released a slot before the second"
+    assert Timing(exposure_cycles=(64, 2000)).lit_cycles() == 120 + 2000 + 32
+    assert Timing(exposure_cycles=(1000, 64)).lit_cycles() == 120 + 1000 + 888 + 32
 
 
 def test_no_exposure_lights_longer_than_the_cap():
@@ -73,15 +75,15 @@ def test_no_exposure_lights_longer_than_the_cap():
 
 def test_pauses_and_repeats_count():
     quarter = Timing(frame_cycles=64000)
-    assert quarter.rate_hz == 250 and quarter.phase_duty() == pytest.approx(2664 / 64000)
+    assert quarter.rate_hz == 250 and quarter.phase_duty() == pytest.approx(2696 / 64000)
     four = Timing(repeats=4, frame_cycles=64000)
-    assert four.rate_hz == pytest.approx(16e6 / 64000) and four.phase_duty() == pytest.approx(4 * 2664 / 64000)
+    assert four.rate_hz == pytest.approx(16e6 / 64000) and four.phase_duty() == pytest.approx(4 * 2696 / 64000)
     assert Timing(repeats=8, frame_cycles=64000).frame_period_cycles == 8 * 15984, "no shorter than its cycles"
 
 
 def test_each_emitter_is_lit_in_two_of_three_phases_of_the_default_headset(repo_root):
     leds = load_headset(repo_root / "headsets" / "led2gaze.toml")
     assert timing.lights(leds).sum(0).tolist() == [2] * 6
-    assert Timing().emitter_duty(leds) == pytest.approx([2 * 2664 / 15984] * 6)
+    assert Timing().emitter_duty(leds) == pytest.approx([2 * 2696 / 15984] * 6)
     diodes = load_headset(repo_root / "headsets" / "nextgaze_nano.toml")
     assert timing.lights(diodes).astype(int).tolist() == [[1, 0, 0], [0, 1, 0], [0, 0, 1]]

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lights as the virtual Nano counts them, on its pins and in cycles, beside what eye safety and power assume."""
+
+from pathlib import Path
+
+import pytest
+
+from sparsegaze import power, timing
+from sparsegaze.headset import load_headset
+from sparsegaze.timing import Timing
+from sparsegaze.transport import open_link
+
+BOOT_S = 2.2  # bootloader, and a second of darkness after its watchdog
+SECONDS = 0.5
+SOURCE = Path(__file__).parent / "lit_app.c"
+HEADSETS = {"leds": "led2gaze", "photodiodes": "nextgaze_nano"}
+MOST = 65535
+
+
+@pytest.fixture
+def lit(port_with, virtual_nano, repo_root):
+    """Factory: what is counted while the port does as asked; lit(wiring, **asked) -> (headset, counters, nano,
+    link). storm: bytes arrive back to back all the while.
+    """
+
+    def run(wiring="leds", storm=False, seconds=SECONDS, hang=False, **asked):
+        settings = dict(FIRST=MOST, SECOND=MOST, PERIOD=15984, FRAME=0, REPEATS=1, PROBE=255, SLEEP=0)
+        settings.update({name.upper(): value for name, value in asked.items()})
+        settings["WIRING"] = int(wiring != "leds")
+        flags = [f"-DASK_{name}={value}{'UL' if name == 'FRAME' else ''}" for name, value in settings.items()]
+        path = repo_root / "headsets" / (HEADSETS[wiring] + ".toml")
+        elf = port_with(SOURCE, *flags, *(["-DASK_HANG"] if hang else []))
+        nano = virtual_nano(headset=path, map=False, unpaced=True, app=elf)
+        link = open_link(nano.port)
+        link.sleep(BOOT_S)
+        nano.control.counters_clear()
+        began = nano.control.time().cycle
+        end = link.now() + seconds
+        while link.now() < end:
+            if storm:
+                link.write(bytes(range(1, 201)))
+            link.sleep(0.002)
+        counted = nano.control.counters()
+        counted["cycles"] = nano.control.time().cycle - began
+        link.close()
+        headset = load_headset(path)
+        duty = [counted[f"lit_cycles_{i}"] / counted["cycles"] for i in range(len(headset.emitters))]
+        return headset, duty, counted
+
+    return run
+
+
+@pytest.mark.parametrize("wiring", ["leds", "photodiodes"])
+def test_lights_at_the_longest_exposures_are_those_that_eye_safety_assumes(lit, wiring):
+    headset, duty, counted = lit(wiring)
+    assumed = Timing().emitter_duty(headset)
+    print("lit", duty, "assumed", assumed[0], "longest pulse, cycles", counted["longest_pulse_cycles"])
+    for measured, most in zip(duty, assumed):
+        assert 0.95 * most < measured <= most
+    assert counted["most_lit"] == (4 if wiring == "leds" else 1)
+    assert counted["longest_pulse_cycles"] <= Timing().lit_cycles(timing.LATE_CYCLES)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        dict(period=31986),
+        dict(period=20016, first=1500, second=1234),
+        dict(first=1, second=1),
+        dict(first=1, second=MOST),
+        dict(first=MOST, second=1),
+        dict(repeats=16),
+        dict(probe=3),
+        dict(period=31986, probe=0),
+        dict(storm=True),
+        dict(storm=True, period=31986, repeats=4, frame=200_000),
+    ],
+    ids=lambda asked: ",".join("%s=%s" % item for item in asked.items()),
+)
+def test_nothing_that_is_asked_for_lights_longer_than_eye_safety_assumes(lit, asked):
+    headset, duty, counted = lit(**asked)
+    late = timing.LATE_CYCLES if asked.get("storm") else 0
+    if "probe" in asked:
+        share = timing.PHASES * max(t.phase_duty(late) for t in (Timing(), Timing(timing.SLOT_CYCLES_MAX)))
+        most = [share * (i == asked["probe"]) for i in range(6)]
+        assert counted["most_lit"] == 1
+    else:
+        longest = max((Timing(), Timing(timing.SLOT_CYCLES_MAX)), key=lambda t: t.phase_duty(late))
+        most = longest.emitter_duty(headset, late)
+    assert all(measured <= bound for measured, bound in zip(duty, most)), (duty, most)
+    assert max(duty) > 0.1 * max(most), "something was lit"
+    assert counted["longest_pulse_cycles"] <= Timing(timing.SLOT_CYCLES_MAX).lit_cycles(timing.LATE_CYCLES)
+
+
+def test_a_program_that_hangs_while_lit_is_dark_before_eye_safety_says_and_stays_so_for_its_lockout(lit):
+    _, duty, counted = lit(hang=True, seconds=8.0)
+    watchdog = timing.WATCHDOG_MS * 1e-3 * timing.CPU_HZ
+    print("longest pulse", counted["longest_pulse_cycles"] / 16e3, "ms, lit", duty)
+    assert 0.9 * watchdog < counted["longest_pulse_cycles"] <= (1 + timing.WATCHDOG_SPREAD) * watchdog
+    assert counted["most_lit"] == 4 and counted["wdt_resets"] >= 4
+    # 400 good cycles, a hang, a second of darkness, and again
+    good, hung, dark = 400 * 15984, watchdog, timing.LOCKOUT_MS * 1e-3 * timing.CPU_HZ
+    most = (good / 3 + hung) / (good + hung + dark)
+    assert 0.8 * most < max(duty) < 1.1 * most
+
+
+def test_low_power_lights_and_sleeps_as_the_budget_says(lit):
+    headset, duty, counted = lit(frame=64_000, sleep=1)
+    low = next(one for one in power.budgets(headset) if one.setting == "250 Hz, low power")
+    assert sum(duty) == pytest.approx(low.lit, rel=0.05)
+    # This application computes nothing: more asleep than with a model and a stream, which AWAKE_CYCLES counts.
+    asleep = counted["asleep_cycles"] / counted["cycles"]
+    assert asleep > 1 - power.AWAKE_CYCLES / 64_000
+    _, _, awake = lit(frame=64_000, sleep=0)
+    assert awake["asleep_cycles"] == 0
