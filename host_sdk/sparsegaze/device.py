@@ -226,6 +226,8 @@ class Device(Sensing):
         if image is None:
             return self._exchange.request(lib.SG_MSG_TRIAL_USE, wire.body("struct sg_mode", mode=0), Verdict)
         data = bytes(getattr(image, "image", image))
+        if not self.hello.trial_bytes:
+            raise DeviceError(lib.SG_E_BOUNDS, "this board has no room for a trial model", "upload it")
         if len(data) > self.hello.trial_bytes:
             raise DeviceError(lib.SG_E_BOUNDS,
                               f"a trial model of {len(data)} bytes does not fit into the device's "

@@ -141,8 +141,8 @@ class FakeDevice:
             cpu_hz=16_000_000,
             exposure_min_us=4,
             exposure_max_us=330,
-            slot_bytes=3072,
-            trial_bytes=640,
+            slot_bytes=2048,
+            trial_bytes=0,
         )
         self.port, self.baud = "PORT", 1_000_000
         self.frame_us, self.limit_hz, self.refuse, self.see = frame_us, limit_hz, set(refuse), see

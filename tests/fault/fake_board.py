@@ -10,6 +10,7 @@ import tty
 from sparsegaze import wire
 from sparsegaze.wire import ffi, lib
 
+SLOTS, SLOT_BYTES = (0x6800, 0x7000), 2048     # the Nano's model slots
 SPEED_BOOTLOADER = {termios.B115200: 115200, termios.B57600: 57600}
 
 
@@ -105,11 +106,11 @@ class FakeBoard(PtyPeer):
         self.writes = []
         self.requests = []
         self.answers = 0
-        self.hello = dict(firmware=0x000100, slot_bytes=lib.SG_MODEL_SLOT_BYTES, slot_base=[0x6000, 0x6C00],
+        self.hello = dict(firmware=0x000100, slot_bytes=SLOT_BYTES, slot_base=list(SLOTS),
                           cpu_hz=16000000,
                           wire_version=lib.SG_WIRE_VERSION, model_version=lib.SG_MODEL_VERSION,
                           frame_period_us=999,
-                          exposure_min_us=4, exposure_max_us=330, page_bytes=128, trial_bytes=640,
+                          exposure_min_us=4, exposure_max_us=330, page_bytes=128, trial_bytes=0,
                           board=lib.SG_BOARD_NANO328P, channels=6)
         self.hello.update(hello or {})
         self._decoder = wire.Decoder()
@@ -181,7 +182,7 @@ class FakeBoard(PtyPeer):
         info = {"crc": [0] * 3, "generation": [0] * 3, "vectors": [0] * 3, "channels": [0] * 3,
                 "verdict": [lib.SG_E_MAGIC] * 3, "active": lib.SG_SLOT_NONE}
         for slot, base in enumerate(self.hello["slot_base"]):
-            image = bytes(self.flash[base:base + lib.SG_MODEL_SLOT_BYTES])
+            image = bytes(self.flash[base:base + SLOT_BYTES])
             head = ffi.from_buffer("struct sg_model_head *", image)
             info["verdict"][slot] = lib.sg_model_open(ffi.new("struct sg_model_view *"),
                                                       ffi.from_buffer(image), len(image), 0)

@@ -5,7 +5,7 @@ import random
 
 import pytest
 from material import make_image
-from fake_board import FakeBoard
+from fake_board import SLOT_BYTES, SLOTS, FakeBoard
 
 from sparsegaze import device as device_module
 from sparsegaze import store, wire
@@ -76,7 +76,7 @@ def test_uploads_alternate_between_the_slots_and_generations_grow():
         assert [report.slot for report in reports] == [0, 1, 0]
         assert [report.generation for report in reports] == [1, 2, 3]
         assert [report.vectors for report in reports] == [70] * 3
-        stored = bytes(board.flash[0x6000:0x6000 + len(images[2])])
+        stored = bytes(board.flash[SLOTS[0]:SLOTS[0] + len(images[2])])
         assert stored == store.stamp(images[2], 3)
         assert ffi.from_buffer("struct sg_model_head *", stored).crc == reports[2].crc
 
@@ -84,7 +84,7 @@ def test_uploads_alternate_between_the_slots_and_generations_grow():
 def test_header_page_is_the_last_one_written():
     with FakeBoard() as board:
         store.upload(board.port, make_image(8))
-        assert board.writes == [0x6000 + 128 * i for i in range(1, 9)] + [0x6000]
+        assert board.writes == [SLOTS[0] + 128 * i for i in range(1, 9)] + [SLOTS[0]]
 
 
 @pytest.mark.parametrize("after", range(9))
@@ -99,14 +99,15 @@ def test_cable_pulled_after_any_page_leaves_the_old_model_bit_for_bit(after):
         store.upload(board.port, new)
     assert "not finished" in caught.value.message
     assert ("old model is still in place" in caught.value.remedy) or after == 8
-    assert bytes(board.flash[0x6000:0x6C00]) == flash[0x6000:0x6C00]
+    first = slice(SLOTS[0], SLOTS[0] + SLOT_BYTES)
+    assert bytes(board.flash[first]) == flash[first]
     again = FakeBoard()
     with again:
         again.flash[:] = board.flash
         with device_module.Device(again.port) as device:
             info = device.model_info()
             assert info.active == 0 and info.crc[0] == ffi.from_buffer("struct sg_model_head *",
-                                                                       flash[0x6000:0x6080]).crc
+                                                                       flash[first][:128]).crc
             assert info.verdict[1] != lib.SG_OK
         assert store.upload(again.port, new).slot == 1      # and the next upload succeeds
 

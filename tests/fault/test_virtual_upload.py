@@ -2,12 +2,15 @@
 """Uploads to a virtual Nano that are cut: power at chosen cycles, the cable at chosen pages."""
 
 import pytest
+from fake_board import SLOT_BYTES, SLOTS
 from material import make_image
 
 from sparsegaze import store
 from sparsegaze.device import Device
 from sparsegaze.errors import DisconnectedError, FlashError, ModelError, NoDeviceError
 from sparsegaze.wire import ffi, lib
+
+MOST_VECTORS = 147             # of 12 bytes, with the smallest grid, in a slot of the Nano
 
 CYCLES_PER_MS = 16000
 # A page takes about 20 ms: its address, 133 bytes at 115200 baud, erasing, programming.
@@ -99,15 +102,16 @@ def test_simulator_killed_during_an_upload_is_a_pulled_cable(virtual_nano, firmw
 def test_largest_model_fits_a_slot_and_leaves_its_neighbours_alone(virtual_nano, firmware_hex, tmp_path):
     state = tmp_path / "state"
     nano = virtual_nano(map=False, unpaced=True, app=firmware_hex, state_dir=state)
-    images = [make_image(80 + i, vectors=lib.SG_MODEL_VECTORS_MAX) for i in range(2)]
+    images = [make_image(80 + i, vectors=MOST_VECTORS) for i in range(2)]
     for image in images:
-        assert store.upload(nano.port, image).vectors == lib.SG_MODEL_VECTORS_MAX
+        assert store.upload(nano.port, image).vectors == MOST_VECTORS
     nano.stop()
     flash = (state / "flash.bin").read_bytes()
     for slot, image in enumerate(images):
-        base = 0x6000 + slot * lib.SG_MODEL_SLOT_BYTES
+        base = SLOTS[slot]
+        assert len(image) > SLOT_BYTES - 20        # another vector would not fit
         assert flash[base:base + len(image)] == store.stamp(image, slot + 1)
-    assert flash[0x6000 + 2 * lib.SG_MODEL_SLOT_BYTES:0x7E00] == b"\xff" * (0x7E00 - 0x7800)
+    assert flash[SLOTS[1] + SLOT_BYTES:0x7E00] == b"\xff" * (0x7E00 - 0x7800)
 
 
 def test_damaged_model_is_refused_with_the_device_untouched(virtual_nano, firmware_hex):
