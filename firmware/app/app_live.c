@@ -2,17 +2,10 @@
 // Live state: what outlives a power cycle but is not a model. Stored whole whenever it changes.
 #include "app.h"
 
-#include <stddef.h>
 #include <string.h>
 
 enum {
     RECORD_VERSION = 3,
-    // What the record of firmware that spoke wire 2 held is the beginning of this one, but for the exposures,
-    // which another circuit wanted. That of wire 1 had no gains; all else stood in the same order.
-    V2_BYTES = 28,
-    GAINS_AT = offsetof(struct app_live, recentre.gain_q9),
-    AFTER_GAINS = GAINS_AT + sizeof(((struct sg_affine *)0)->gain_q9),
-    V1_BYTES = V2_BYTES - (AFTER_GAINS - GAINS_AT),
     // Exposures are stored when they moved by more than an eighth, looked at every 1.05 s: 28 looks (30 s)
     // after start, then at most every 572 (10 minutes), which 10^5 EEPROM cycles bear for two years of light
     // that never rests.
@@ -23,7 +16,6 @@ enum {
 };
 _Static_assert(sizeof(struct app_live) == 52, "layout in EEPROM");
 _Static_assert(sizeof(struct app_live) <= HAL_RECORD_MAX, "fits the port's store");
-_Static_assert(offsetof(struct app_live, version) == V2_BYTES - 1, "begins like the one of version 2");
 
 struct app_live app_live;
 static uint8_t dirty;
@@ -31,26 +23,11 @@ static uint8_t second;                  // of device time, 1.05 s long
 static uint8_t resting;                 // looks until exposures set by command are stored
 static uint16_t looks = LOOKS_FIRST;
 
-SELDOM static uint8_t load_old(void)
-{
-    uint8_t *byte = (uint8_t *)&app_live;
-    if (!hal_load(byte, V2_BYTES) || app_live.version != 2) {
-        if (!hal_load(byte, V1_BYTES))
-            return 0;
-        memmove(byte + AFTER_GAINS, byte + GAINS_AT, V1_BYTES - GAINS_AT);
-        memset(byte + GAINS_AT, 0, AFTER_GAINS - GAINS_AT);
-        if (app_live.version != 1)
-            return 0;
-    }
-    return 1;
-}
-
 SELDOM void app_live_start(void)
 {
     if (!hal_load(&app_live, sizeof app_live) || app_live.version != RECORD_VERSION) {
-        if (!load_old())
-            memset(&app_live, 0, sizeof app_live);
-        memset((uint8_t *)&app_live + V2_BYTES, 0, sizeof app_live - V2_BYTES);
+        // Older records have another size; their exposures were for another circuit.
+        memset(&app_live, 0, sizeof app_live);
         for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
             app_live.exposure_cycles[i] = SG_EXPOSE_START_CYCLES;
             app_live.limit_cycles[i] = UINT16_MAX;
@@ -117,8 +94,7 @@ SELDOM static void look(void)
     looks = 1;
     for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
         const uint16_t now = app.expose.led[i].exposure_cycles, stored = app_live.exposure_cycles[i];
-        const uint16_t moved = now > stored ? now - stored : stored - now;
-        if (moved > stored >> 3) {
+        if ((now > stored ? now - stored : stored - now) > stored >> 3) {
             keep_exposures();
             looks = LOOKS_LATER;
             return;

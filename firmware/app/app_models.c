@@ -9,7 +9,8 @@
 #include "sg_rom.h"
 
 // A piece of a check: of the pages so many bytes, else a node or a record. It may make a frame wait.
-enum { SLOTS = 3, PIECE_BYTES = 8, CRC_FROM = 8 };
+// A board may have no room for a trial: what is only for that is then left out.
+enum { TRIAL = HAL_TRIAL_BYTES != 0, SLOTS = TRIAL ? 3 : 2, PIECE_BYTES = 8, CRC_FROM = 8 };
 
 // A check under way, of slot `slot`, asked for by request `seq`.
 struct check {
@@ -27,27 +28,30 @@ static int8_t verdict[SLOTS];
 static uint8_t active = SG_SLOT_NONE;
 static uint8_t stored = SG_SLOT_NONE;           // what TRIAL_USE 0 goes back to
 static struct check check;
-static uint8_t trial[HAL_TRIAL_BYTES];
+static uint8_t trial[TRIAL ? HAL_TRIAL_BYTES : 1];
 
 static const uint8_t *slot_image(uint8_t slot)
 {
-    return slot == SG_SLOT_RAM ? trial : hal_slot(slot);
+    return TRIAL && slot == SG_SLOT_RAM ? trial : hal_slot(slot);
 }
 
 static uint16_t slot_room(uint8_t slot)
 {
-    return slot == SG_SLOT_RAM ? (uint16_t)HAL_TRIAL_BYTES : app.slot_bytes;
+    return TRIAL && slot == SG_SLOT_RAM ? (uint16_t)HAL_TRIAL_BYTES : app.slot_bytes;
 }
 
 static uint8_t slot_space(uint8_t slot)
 {
-    return slot == SG_SLOT_RAM ? (uint8_t)SG_ROM_MEMORY : (uint8_t)HAL_SLOT_SPACE;
+    return TRIAL && slot == SG_SLOT_RAM ? (uint8_t)SG_ROM_MEMORY : (uint8_t)HAL_SLOT_SPACE;
 }
 
-SELDOM static void forget(uint8_t slot, int8_t why)
+// No trial, or one not checked since it was written.
+static void forget_trial(int8_t why)
 {
-    memset(&view[slot], 0, sizeof view[slot]);
-    verdict[slot] = why;
+    if (!TRIAL)
+        return;
+    memset(&view[SG_SLOT_RAM], 0, sizeof view[SG_SLOT_RAM]);
+    verdict[SG_SLOT_RAM] = why;
 }
 
 // Another model takes another time.
@@ -59,19 +63,57 @@ SELDOM static void use(uint8_t slot)
     app_rate_renew();
 }
 
+// The next piece of the check. The nodes and records count once all of it is known.
+static void step(void)
+{
+    const uint8_t *image = slot_image(check.slot);
+    const uint8_t space = slot_space(check.slot);
+    uint16_t next = check.at + PIECE_BYTES;
+    if (check.at >= SG_MODEL_HEAD_BYTES) {
+        next = sg_model_part(image, check.at, space);
+        if (check.parts == SG_OK)
+            check.parts = (int8_t)sg_model_check_part(image, check.at, space);
+    }
+    check.crc = sg_model_crc32_at(check.crc, image + check.at, next - check.at, space);
+    check.at = next;
+}
+
+SELDOM static int8_t judge(struct sg_model_view *found)
+{
+    memset(found, 0, sizeof *found);
+    return (int8_t)sg_model_open_checked(found, slot_image(check.slot), slot_room(check.slot),
+                                         slot_space(check.slot), check.crc, check.parts);
+}
+
+// The header alone decides how far to read; one that is wrong is answered for at once, with CRC 0.
+SELDOM static int8_t begin(uint8_t type, uint8_t slot, uint16_t seq)
+{
+    const uint8_t *image = slot_image(slot);
+    if (!image)
+        return SG_E_BOUNDS;
+    if (check.at)
+        return SG_E_BUSY;
+    const int length = sg_model_length(image, slot_room(slot), slot_space(slot));
+    check = (struct check){ .at = CRC_FROM, .seq = seq, .type = type, .slot = slot };
+    check.length = length < 0 ? 0 : (uint16_t)length;
+    return SG_OK;
+}
+
 SELDOM void app_models_start(void)
 {
     for (uint8_t slot = SG_SLOT_A; slot <= SG_SLOT_B; slot++) {
-        const uint8_t *image = hal_slot(slot);
-        forget(slot, SG_E_MAGIC);
-        if (!image)
+        verdict[slot] = SG_E_MAGIC;
+        if (begin(0, slot, 0) != SG_OK)
             continue;
-        verdict[slot] = (int8_t)sg_model_open(&view[slot], image, slot_room(slot), slot_space(slot));
+        while (check.at < check.length)
+            step();
+        verdict[slot] = judge(&view[slot]);
+        check.at = 0;
         if (verdict[slot] == SG_OK
             && (stored == SG_SLOT_NONE || (int32_t)(view[slot].generation - view[stored].generation) > 0))
             stored = slot;
     }
-    forget(SG_SLOT_RAM, SG_E_MAGIC);
+    forget_trial(SG_E_MAGIC);
     active = stored;
 }
 
@@ -95,12 +137,14 @@ SELDOM void app_model_info(struct sg_model_info *info)
         info->channels[slot] = view[slot].channels;
         info->verdict[slot] = verdict[slot];
     }
+    if (!TRIAL)
+        info->verdict[SG_SLOT_RAM] = SG_E_MAGIC;
     info->active = active;
 }
 
 SELDOM int8_t app_model_read(const struct sg_model_at *at, struct sg_model_data *data)
 {
-    if (at->slot >= SLOTS || at->length < 1 || at->length > SG_WIRE_DATA_MAX)
+    if (at->slot > SG_SLOT_RAM || at->length < 1 || at->length > SG_WIRE_DATA_MAX)
         return SG_E_ARG;
     const uint8_t *image = slot_image(at->slot);
     const uint16_t room = slot_room(at->slot);
@@ -121,27 +165,13 @@ SELDOM static void answer(int8_t result)
     if (!app_send(check.type | SG_REPLY, check.seq, &body, sizeof body, 0))
         return;
     check.at = 0;
-    if (check.type == SG_MSG_TRIAL_USE && result == SG_OK)
+    if (TRIAL && check.type == SG_MSG_TRIAL_USE && result == SG_OK)
         use(SG_SLOT_RAM);
-}
-
-// The header alone decides how far to read; one that is wrong is answered for at once, with CRC 0.
-SELDOM static int8_t begin(uint8_t type, uint8_t slot, uint16_t seq)
-{
-    const uint8_t *image = slot_image(slot);
-    if (!image)
-        return SG_E_BOUNDS;
-    if (check.at)
-        return SG_E_BUSY;
-    const int length = sg_model_length(image, slot_room(slot), slot_space(slot));
-    check = (struct check){ .at = CRC_FROM, .seq = seq, .type = type, .slot = slot };
-    check.length = length < 0 ? 0 : (uint16_t)length;
-    return SG_OK;
 }
 
 SELDOM int8_t app_model_verify(uint8_t slot, uint16_t seq)
 {
-    if (slot >= SLOTS)
+    if (slot > SG_SLOT_RAM)
         return SG_E_ARG;
     return begin(SG_MSG_MODEL_VERIFY, slot, seq);
 }
@@ -167,14 +197,14 @@ SELDOM int8_t app_trial_write(const struct sg_model_data *data)
 {
     if (data->slot != SG_SLOT_RAM || data->length < 1 || data->length > SG_WIRE_DATA_MAX)
         return SG_E_ARG;
-    if (data->offset > (uint16_t)HAL_TRIAL_BYTES || data->length > (uint16_t)HAL_TRIAL_BYTES - data->offset)
+    if (!TRIAL || data->offset > (uint16_t)HAL_TRIAL_BYTES || data->length > (uint16_t)HAL_TRIAL_BYTES - data->offset)
         return SG_E_BOUNDS;
     if (check.at && check.slot == SG_SLOT_RAM)
         return SG_E_BUSY;
     if (active == SG_SLOT_RAM)
         use(stored);            // a model in use never changes
     memcpy(trial + data->offset, data->data, data->length);
-    forget(SG_SLOT_RAM, SG_E_STATE);            // not checked since
+    forget_trial(SG_E_STATE);
     return SG_OK;
 }
 
@@ -183,11 +213,9 @@ SELDOM uint8_t app_models_finish(void)
     if (!check.at || check.at < check.length)
         return 0;
     struct sg_model_view found;
-    memset(&found, 0, sizeof found);
-    const int8_t result = (int8_t)sg_model_open_checked(&found, slot_image(check.slot), slot_room(check.slot),
-                                                        slot_space(check.slot), check.crc, check.parts);
+    const int8_t result = judge(&found);
     // Flash cannot have changed since boot; what a verification finds there is only told.
-    if (check.slot == SG_SLOT_RAM && active != SG_SLOT_RAM) {
+    if (TRIAL && check.slot == SG_SLOT_RAM && active != SG_SLOT_RAM) {
         view[SG_SLOT_RAM] = found;
         verdict[SG_SLOT_RAM] = result;
     }
@@ -197,15 +225,6 @@ SELDOM uint8_t app_models_finish(void)
 
 void app_models_step(void)
 {
-    if (!check.at || check.at >= check.length)
-        return;
-    const uint8_t *image = slot_image(check.slot);
-    const uint8_t space = slot_space(check.slot);
-    uint16_t next = sg_model_part(image, check.at, space);
-    if (check.at < SG_MODEL_HEAD_BYTES)
-        next = check.at + PIECE_BYTES;
-    else if (check.parts == SG_OK)
-        check.parts = (int8_t)sg_model_check_part(image, check.at, space);
-    check.crc = sg_model_crc32_at(check.crc, image + check.at, next - check.at, space);
-    check.at = next;
+    if (check.at && check.at < check.length)
+        step();
 }

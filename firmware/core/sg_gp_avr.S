@@ -1,13 +1,29 @@
 // SPDX-License-Identifier: Apache-2.0
 ; sg_gp_loop.c for AVR with a multiplier, bit-identical to it. Formats in sg_gp_loop.h.
 ;
-; Nothing here takes a time that depends on data.
+; Nothing here takes a time that depends on data. SG_GP_FLASH_ONLY leaves out what reads models from ordinary memory,
+; for a build that never has one there.
 
 #if defined(__AVR__) && !defined(SG_GP_PORTABLE)
 
 #define SUM_S2 8
 #define SUM_S 12
 #define SUM_S8 24
+
+; body, for the memory that bit 0 of a register says (SG_ROM_FLASH)
+.macro by_space space, body
+#ifdef SG_GP_FLASH_ONLY
+    \body lpm
+#else
+    sbrs \space, 0
+    rjmp 98f
+    \body lpm
+    rjmp 99f
+98:
+    \body ld
+99:
+#endif
+.endm
 
 ; ---- void sg_gp_loop(struct sg_gp_sum *sum r25:r24, const uint8_t *record r23:r22, uint8_t n r20,
 ;                      uint8_t space r18)
@@ -161,13 +177,7 @@ sg_gp_loop:
     ldd el2, Y+6
     mov left, r0
     ldi zero, 0
-    sbrc r1, 0                  ; SG_ROM_FLASH
-    rjmp from_flash
-    loop ld
-    rjmp done
-from_flash:
-    loop lpm
-done:
+    by_space r1, loop
     pop r29
     pop r28
     std Y+0, az0
@@ -315,11 +325,13 @@ sg_gp_scale:
     clr square1_
     clr square2_
     clr square3_
-    brtc 2f
-    scale lpm
+#ifndef SG_GP_FLASH_ONLY
+    brts 2f
+    scale ld
     rjmp 3f
 2:
-    scale ld
+#endif
+    scale lpm
 3:
     ldi mask, 3                 ; >> 5 is << 3 and the upper three bytes
 4:
@@ -393,12 +405,11 @@ sg_gp_scale:
 .macro output load, at
     movw r26, r28
     adiw r26, SUM_S
+    ldi count, 6
+2:
     slope \load
-    slope \load
-    slope \load
-    slope \load
-    slope \load
-    slope \load
+    dec count
+    brne 2b
     ldi count, 4                ; >> 4 is << 4 and the upper three bytes
 1:
     lsl acc0
@@ -443,13 +454,7 @@ sg_gp_trend:
     clr zero
     movw r28, r24
     movw r30, r22
-    sbrs r20, 0                 ; SG_ROM_FLASH
-    rjmp 2f
-    outputs lpm
-    rjmp 3f
-2:
-    outputs ld
-3:
+    by_space r20, outputs
     pop r29
     pop r28
     pop zero
@@ -609,13 +614,7 @@ sg_gp_find:
     movw r28, r18
     movw r30, r22
     movw grid0, r22
-    sbrs r20, 0                 ; SG_ROM_FLASH
-    rjmp 3f
-    description lpm
-    rjmp 4f
-3:
-    description ld
-4:
+    by_space r20, description
     along from0, from1, scale0, wide, r22, r23
     along from2, from3, scale1, tall, r24, r25
     mul r23, r25                ; shares
@@ -797,6 +796,11 @@ sg_gp_find:
     rol high
 .endm
 
+.macro judged load
+    guard \load
+    sigma \load
+.endm
+
     .section .text.sg_gp_judge, "ax", @progbits
     .global sg_gp_judge
     .type sg_gp_judge, @function
@@ -834,15 +838,7 @@ sg_gp_judge:
     clr doubt1
     ldi value, 4
     mov guards_left, value
-    sbrs r18, 0                 ; SG_ROM_FLASH
-    rjmp 6f
-    guard lpm
-    sigma lpm
-    rjmp 7f
-6:
-    guard ld
-    sigma ld
-7:
+    by_space r18, judged
     movw r30, r16
     st Z, doubt0
     std Z+1, doubt1
