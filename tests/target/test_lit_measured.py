@@ -9,6 +9,7 @@ from sparsegaze import power, timing
 from sparsegaze.headset import load_headset
 from sparsegaze.timing import Timing
 from sparsegaze.transport import open_link
+from sparsegaze.wiring import PHASES
 
 BOOT_S = 2.2  # bootloader, and a second of darkness after its watchdog
 SECONDS = 0.5
@@ -19,11 +20,11 @@ MOST = 65535
 
 @pytest.fixture
 def lit(port_with, virtual_nano, repo_root):
-    """Factory: what is counted while the port does as asked; lit(wiring, **asked) -> (headset, counters, nano,
-    link). storm: bytes arrive back to back all the while.
+    """Factory: what is counted while the port does as asked; lit(wiring, **asked) -> (headset, duty [emitter],
+    counters). storm: bytes arrive back to back all the while; log: file for the electrical moments.
     """
 
-    def run(wiring="leds", storm=False, seconds=SECONDS, hang=False, **asked):
+    def run(wiring="leds", storm=False, seconds=SECONDS, hang=False, log=None, **asked):
         settings = dict(FIRST=MOST, SECOND=MOST, PERIOD=15984, FRAME=0, REPEATS=1, PROBE=255, SLEEP=0)
         settings.update({name.upper(): value for name, value in asked.items()})
         settings["WIRING"] = int(wiring != "leds")
@@ -34,6 +35,7 @@ def lit(port_with, virtual_nano, repo_root):
         link = open_link(nano.port)
         link.sleep(BOOT_S)
         nano.control.counters_clear()
+        nano.control.frames(log)
         began = nano.control.time().cycle
         end = link.now() + seconds
         while link.now() < end:
@@ -41,6 +43,7 @@ def lit(port_with, virtual_nano, repo_root):
                 link.write(bytes(range(1, 201)))
             link.sleep(0.002)
         counted = nano.control.counters()
+        nano.control.frames(None)
         counted["cycles"] = nano.control.time().cycle - began
         link.close()
         headset = load_headset(path)
@@ -102,6 +105,25 @@ def test_a_program_that_hangs_while_lit_is_dark_before_eye_safety_says_and_stays
     good, hung, dark = 400 * 15984, watchdog, timing.LOCKOUT_MS * 1e-3 * timing.CPU_HZ
     most = (good / 3 + hung) / (good + hung + dark)
     assert 0.8 * most < max(duty) < 1.1 * most
+
+
+@pytest.mark.parametrize("wiring", ["leds", "photodiodes"])
+def test_the_firmware_senses_in_the_phases_of_headset_files(lit, wiring, tmp_path):
+    log = tmp_path / "moments.csv"
+    lit(wiring, log=log, seconds=0.01, first=1000, second=1000)
+    phases, sampled, lights = [], [], 0
+    for row in log.read_text().splitlines():
+        what, _, value = row.split(",")[0].partition(":")
+        if what == "adc" and lights and int(value) < 6:
+            sampled.append(int(value))
+        elif what == "lit" and int(value, 0) != lights:
+            if lights and sampled:
+                phases.append((tuple(sampled), tuple(i for i in range(6) if lights >> i & 1)))
+            lights, sampled = int(value, 0), []
+    assert len(phases) > 20
+    start = phases.index(PHASES[wiring][0])
+    for k, phase in enumerate(phases[start:-1]):
+        assert phase == PHASES[wiring][k % 3]
 
 
 def test_low_power_lights_and_sleeps_as_the_budget_says(lit):

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from sparsegaze import timing, wiring
+from sparsegaze import timing
 from sparsegaze.headset import load_headset
 from sparsegaze.timing import Timing
 
@@ -44,13 +44,6 @@ def test_the_watchdog_is_set_to_what_eye_safety_is_computed_from(port):
     # Named after the data sheet's "typical 0.125 s", which is 16,384 periods of 128 kHz.
     assert re.findall(r"wdt_enable\(WDTO_(\d+)MS\)", port).count("120") == 1
     assert timing.WATCHDOG_MS == 16384 / 128
-
-
-@pytest.mark.parametrize("kind, name", [("leds", "SG_WIRING_LEDS"), ("photodiodes", "SG_WIRING_PHOTODIODES")])
-def test_the_firmware_senses_in_the_phases_of_headset_files(port, kind, name):
-    pairs = re.search(r"\[%s\] = \{ (\{.*\}) \}" % name, port).group(1)
-    found = tuple(tuple(map(int, pair)) for pair in re.findall(r"\{ (\d), (\d) \}", pairs))
-    assert found == tuple(sense for sense, _ in wiring.PHASES[kind])
 
 
 def test_the_longest_lights_by_the_slots():
