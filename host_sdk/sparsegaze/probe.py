@@ -19,6 +19,11 @@ from .errors import RecordingError, SceneError, SparsegazeError
 from .wire import lib
 
 LEDS = 6
+# (sensor, emitter) that say nothing: the emitter's own pin, high, is converted just before the sensor's (they
+# are a pair in the sensing cycle), and what the sample capacitor holds then goes into the reading.
+UNKNOWN = ((0, 5), (4, 1), (3, 2))
+KNOWN = ~np.eye(LEDS, dtype=bool)
+KNOWN[tuple(zip(*UNKNOWN))] = False
 SWAP_LEAST, SWAP_LEAST_PARTS = 0.12, 0.4  # octaves rms: as near as this to the reference, nothing is swapped;
 # the same for a simulated reference of other parts and another face
 SWAP_GAIN = {6: 0.6, 5: 0.45, 4: 0.3}  # an exchange must leave at most this share, by how many LEDs live
@@ -45,7 +50,7 @@ class Diagnosis(NamedTuple):
 
 
 def measure(device, repeats=3, progress=None):
-    """Probe an open device: float64 [sensor, emitter], log2 photocurrent; NaN where too little came."""
+    """Probe an open device: float64 [sensor, emitter], log2 photocurrent; NaN: too little, or UNKNOWN."""
     if device.settings().wiring != lib.SG_WIRING_LEDS:
         raise SparsegazeError(
             "only LEDs that sense and emit can be told by who sees whom",
@@ -62,8 +67,7 @@ def measure(device, repeats=3, progress=None):
     seen = np.isfinite(found).sum(axis=0) > repeats // 2
     with np.errstate(all="ignore"):
         out = np.where(seen, np.nanmedian(np.where(np.isfinite(found), found, np.nan), axis=0), np.nan)
-    np.fill_diagonal(out, np.nan)
-    return out
+    return np.where(KNOWN, out, np.nan)
 
 
 def simulated(headset=None, person=0):
@@ -110,12 +114,12 @@ def compare(measured, reference, stored=True):
             ],
         )
     depth = np.nanmedian(measured) - np.nanmin(measured) + FAINTER
-    measured_full, reference = _levelled(measured, depth), _levelled(reference, depth)
+    measured_full, reference = _levelled(measured, depth), _levelled(_completed(reference), depth)
     seen = np.isfinite(measured)
     whole = (seen.sum(axis=1) > SEEN_LEAST) & (seen.sum(axis=0) > SEEN_LEAST)
     place = _place(measured_full, reference, whole, SWAP_LEAST if stored else SWAP_LEAST_PARTS)
     moved = np.array(place)
-    difference = measured_full - reference[np.ix_(moved, moved)]
+    difference = np.where(KNOWN, measured_full - reference[np.ix_(moved, moved)], np.nan)
     sensor, emitter = _parts(difference)
     gone = (
         (sensor - np.median(sensor) < -limit) | (seen.sum(axis=1) == 0),
@@ -157,8 +161,20 @@ def load(path):
 def _levelled(matrix, depth):
     """The matrix with everything faint, or not seen at all, at one level: `depth` below its median."""
     floor = np.nanmedian(matrix) - depth
-    out = np.where(np.isfinite(matrix), np.maximum(matrix, floor), floor)
-    np.fill_diagonal(out, np.nan)
+    return np.where(np.isfinite(matrix), np.maximum(matrix, floor), floor)
+
+
+def _completed(matrix):
+    """The matrix with UNKNOWN entries from their mirrors: light goes both ways alike, parts do not."""
+    out = matrix.copy()
+    rows, columns = np.nonzero(np.isfinite(matrix + matrix.T) & KNOWN & KNOWN.T)
+    design = np.zeros((len(rows), LEDS))
+    design[np.arange(len(rows)), rows] += 1
+    design[np.arange(len(rows)), columns] -= 1
+    part = np.linalg.pinv(design) @ (matrix - matrix.T)[rows, columns] if len(rows) else np.zeros(LEDS)
+    for sensor, emitter in UNKNOWN:
+        if not np.isfinite(out[sensor, emitter]):
+            out[sensor, emitter] = matrix[emitter, sensor] + part[sensor] - part[emitter]
     return out
 
 
@@ -182,7 +198,7 @@ def _place(measured, reference, whole, least):
 
 
 def _parts(difference):
-    """(sensor [6], emitter [6]) of difference ~ sensor + emitter, by medians; NaN on the diagonal."""
+    """(sensor [6], emitter [6]) of difference ~ sensor + emitter, by medians; NaN where nothing is known."""
     rest = difference.copy()
     sensor, emitter = np.zeros(LEDS), np.zeros(LEDS)
     for _ in range(10):
@@ -199,20 +215,20 @@ def _misfit(difference, whole):
     n = int(whole.sum())
     if n < 4:
         return 0.0  # three LEDs: six pairs, six factors
-    rest = difference[np.ix_(whole, whole)]
-    values = rest[~np.eye(n, dtype=bool)]
-    rest = values - _projection(n) @ values
-    return float(np.sqrt(rest @ rest / (n * (n - 1) - 2 * n + 1)))
+    rows, columns, projection = _projection(tuple(whole))
+    values = difference[rows, columns]
+    rest = values - projection @ values
+    return float(np.sqrt(rest @ rest / (len(rows) - 2 * n + 1)))
 
 
 @functools.lru_cache(maxsize=None)
-def _projection(n):
-    """Onto sums of a row's and a column's factor, of the off-diagonal entries of an n x n matrix."""
-    rows, columns = np.nonzero(~np.eye(n, dtype=bool))
-    design = np.zeros((len(rows), 2 * n))
+def _projection(whole):
+    """(rows, columns, projection onto sums of a row and a column factor) of what is known of `whole` LEDs."""
+    rows, columns = np.nonzero(KNOWN & np.outer(whole, whole))
+    design = np.zeros((len(rows), 2 * LEDS))
     design[np.arange(len(rows)), rows] = 1
-    design[np.arange(len(rows)), n + columns] = 1
-    return design @ np.linalg.pinv(design)
+    design[np.arange(len(rows)), LEDS + columns] = 1
+    return rows, columns, design @ np.linalg.pinv(design)
 
 
 def _swapped(place):
