@@ -84,12 +84,25 @@ def test_second_of_a_pair_shares_with_what_the_first_left_on_the_sampler():
         board.run(1000)
         slots(board, BANDGAP_CHANNEL, FULL | 1)
         shared = board.node(1)[3]
+        assert board.node(1)[0] == pytest.approx(shared, abs=1e-12)     # apart again, both keep that voltage
         total = charge_pc(shared, SAMPLER)
         slots(board, BANDGAP_CHANNEL)
         bandgap = board.node(0)[3]
         assert 0.98 < bandgap < 1.22
         assert total == pytest.approx(SAMPLER * bandgap, rel=5e-3)      # the bandgap has noise of its own
         assert shared == pytest.approx(volts_of(SAMPLER * bandgap, SAMPLER), rel=5e-3)
+
+
+def test_every_conversion_after_ground_takes_its_share_of_a_node_away(board):
+    """An empty sampler, again and again: the charge on the node and the sampler's is what there was before."""
+    slots(board, BANDGAP_CHANNEL, FULL | 1)
+    before = board.node(1)[0]
+    slots(board, BANDGAP_CHANNEL, FULL | 1, GROUND, FULL | 1, GROUND, FULL | 1)
+    after = board.node(1)[0]
+    expected = before
+    for _ in range(2):
+        expected = volts_of(charge_pc(expected), SAMPLER)
+    assert after == pytest.approx(expected, rel=5e-3) and after < 0.6 * before   # the bandgap has noise
 
 
 def test_supply_divider_reads_a_twenty_fifth_of_the_supply_and_follows_it(board):
