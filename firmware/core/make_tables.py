@@ -126,7 +126,6 @@ def light_table():
     weights = [flicker_weights(PERIOD_FROM + PERIOD_STEP * i) for i in range(PERIOD_NODES)]
     k1, k2 = curvature()
     return (LICENSE + MADE_BY + "#ifndef SG_LIGHT_TABLE_H\n#define SG_LIGHT_TABLE_H\n\n"
-            '#include <stdint.h>\n\n#include "sg_rom.h"\n\n'
             f"// Feature of 1/{CODE_UNIT} code collected in 1 cycle.\n"
             f"#define UNIT_Q12 {rounded(FEATURE_PER_OCTAVE * math.log2(unit_a / UNIT_A))}L\n\n"
             "// Curvature of sg_light_loop.c, Q0.16: 2 k1; the same and half a step of x in 3 k2 x; a step of that;\n"
@@ -137,19 +136,17 @@ def light_table():
             f"#define SG_LIGHT_SQUARE_SHIFT {rounded(math.log2(k2 * 256))}\n\n"
             "// Share of the sample capacitor in the capacitance at rest, Q0.16.\n"
             f"#define SHARE_Q16 {rounded(SAMPLE_HOLD_PF / capacitance_at_rest_pf() * 65536)}\n\n"
-            f"// Weights of earlier unlit codes by period, nearest of every {PERIOD_STEP} cycles from {PERIOD_FROM}: b and\n"
-            "// -c of sg_light.h, Q0.8.\n"
-            f"enum {{ PERIOD_FROM = {PERIOD_FROM}, PERIOD_BITS = {PERIOD_STEP.bit_length() - 1}, "
-            f"PERIOD_NODES = {PERIOD_NODES} }};\n"
-            f"static const uint8_t before_q8[{PERIOD_NODES}] SG_ROM = {{\n"
-            + rows([rounded(256 * b) for b, _ in weights]) + "};\n"
-            f"static const uint8_t earlier_minus_q8[{PERIOD_NODES}] SG_ROM = {{\n"
-            + rows([rounded(-256 * c) for _, c in weights]) + "};\n\n#endif\n")
+            f"// Weights of earlier unlit codes by period, nearest of every {PERIOD_STEP} cycles from {PERIOD_FROM} on: b\n"
+            "// and -c of sg_light.h, Q0.8.\n"
+            f"#define PERIOD_FROM {PERIOD_FROM}U\n#define PERIOD_BITS {PERIOD_STEP.bit_length() - 1}\n"
+            f"#define PERIOD_NODES {PERIOD_NODES}\n"
+            f"#define BEFORE_Q8 {{ {', '.join(str(rounded(256 * b)) for b, _ in weights)} }}\n"
+            f"#define EARLIER_MINUS_Q8 {{ {', '.join(str(rounded(-256 * c)) for _, c in weights)} }}\n\n#endif\n")
 
 
 def log2_table():
-    """Text of sg_light_table.c."""
-    mantissa = [rounded(FEATURE_PER_OCTAVE * math.log2(1 + i / 64)) for i in range(65)]
+    """Text of sg_light_table.c. The last entry is one less, so that no logarithm reaches the next octave."""
+    mantissa = [rounded(FEATURE_PER_OCTAVE * math.log2(1 + i / 64)) for i in range(64)] + [FEATURE_PER_OCTAVE - 1]
     return (LICENSE + MADE_BY + '#include "sg_light_loop.h"\n#include "sg_rom.h"\n\n'
             "const uint16_t sg_light_log2_table[65] SG_ROM = {\n" + rows(mantissa) + "};\n")
 

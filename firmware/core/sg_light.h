@@ -46,7 +46,7 @@ struct sg_light_channel {
     int32_t sum_q5;                 // signal of the cycles added, 1/32 code at 0 V
     uint16_t exposure_cycles;       // that of everything here
     int16_t unit_q12;               // feature of 1/32 code in this exposure
-    uint16_t unlit_q5[2];           // of the previous cycle and of the one before it
+    uint16_t unlit_q5[2];           // of the previous cycle and of the one before it, while ambient light moves
     uint16_t mean_q5;               // of unlit codes
     int16_t slope_q16;              // 2 k1 and the channel's curve
     uint8_t settled;                // cycles with this exposure, up to 16
@@ -61,7 +61,7 @@ struct sg_light {
     uint8_t earlier_q8;             // -c
     uint16_t moving;                // mean square of the sum of the unlit codes' departures, 1/64 code^2
     uint8_t wiring;                 // enum sg_wiring
-    uint8_t gap;                    // 1: the next cycle does not follow the previous one
+    uint8_t fresh;                  // earlier unlit codes are none: 1 after a gap, 2 as ambient light begins to move
 };
 
 // Begin, or begin anew after a change of timing or wiring: nothing is known, curves are 0.

@@ -8,6 +8,8 @@
 
 enum { LATE_UNKNOWN = 255 };
 
+const uint8_t sg_light_order[2][6] SG_ROM = { { 5, 0, 1, 4, 2, 3 }, { 0, 3, 1, 4, 2, 5 } };
+
 // Upper half of a product.
 static inline int16_t high(int16_t x, int16_t y)
 {
@@ -36,13 +38,15 @@ static int16_t bend_q5(uint16_t lit_q5, uint16_t unlit_q5, int16_t slope_q16)
 {
     const int16_t difference = (int16_t)(lit_q5 - unlit_q5);
     const uint16_t sum = (uint16_t)(lit_q5 + unlit_q5);
-    const uint8_t x = (uint8_t)(sum >> 8), d = (uint8_t)(size_of(difference) >> 8);
+    const uint8_t x = (uint8_t)(sum >> 8);
+    const int8_t d = (int8_t)(difference >> 8);
     const int16_t slope = (int16_t)(slope_q16 + (int16_t)(x * SG_LIGHT_CUBIC));
     const int16_t bracket = (int16_t)((int16_t)(((int32_t)slope * sum) >> 16) + (int16_t)(((uint16_t)(d * d) >> 8) << SG_LIGHT_SQUARE_SHIFT));
     return high(difference, bracket);
 }
 
-void sg_light_settle(struct sg_light_channel *channel, uint16_t unlit_q5)
+// What is known of a channel's ambient light is this code and no more.
+static void settle(struct sg_light_channel *channel, uint16_t unlit_q5)
 {
     channel->unlit_q5[0] = channel->unlit_q5[1] = channel->mean_q5 = unlit_q5;
     channel->settled = 1;
@@ -95,23 +99,23 @@ static uint16_t ambient_q5(const struct sg_light *light, struct sg_light_channel
         channel->settled++;
     }
     const uint16_t mean = (uint16_t)(channel->mean_q5 + step);
-    const uint16_t before = channel->unlit_q5[0], earlier = channel->unlit_q5[1];
     channel->mean_q5 = mean;
-    channel->unlit_q5[1] = before;
-    channel->unlit_q5[0] = unlit_q5;
     if (pass->moving_q8 == 0) {
         if (size_of(off) < SG_LIGHT_STEP_Q5)
             return mean;
-        sg_light_settle(channel, unlit_q5);
+        settle(channel, unlit_q5);
         if (size_of(off) >= SG_LIGHT_LEAP_Q5)
             channel->flags |= SG_LIGHT_STARVED;
         return unlit_q5;
     }
+    const uint16_t before = channel->unlit_q5[0], earlier = channel->unlit_q5[1];
+    channel->unlit_q5[1] = before;
+    channel->unlit_q5[0] = unlit_q5;
     const int16_t past = (int16_t)(before - unlit_q5), long_past = (int16_t)(earlier - unlit_q5);
     if (size_of(past) >= SG_LIGHT_LEAP_Q5) {    // no flicker falls or rises by all but a sixteenth in a cycle
         const uint16_t most = past < 0 ? unlit_q5 : before;
         if (size_of(past) - SG_LIGHT_LEAP_Q5 >= most - (most >> 4)) {
-            sg_light_settle(channel, unlit_q5);
+            settle(channel, unlit_q5);
             channel->flags |= SG_LIGHT_STARVED;
             return unlit_q5;
         }
@@ -128,7 +132,7 @@ static void begin(struct sg_light_channel *channel, uint16_t exposure_cycles, ui
     channel->exposure_cycles = exposure_cycles;
     channel->unit_q12 = (int16_t)(UNIT_Q12 - sg_light_log2_q12(exposure_cycles == 0 ? 1 : exposure_cycles));
     channel->cycles = 0;
-    sg_light_settle(channel, unlit_q5);
+    settle(channel, unlit_q5);
 }
 
 void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint8_t i, struct sg_light_pass *pass)
@@ -168,17 +172,6 @@ void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint
     pass->unlit_code = unlit;
 }
 
-#ifndef SG_LIGHT_ASSEMBLY
-void sg_light_loop(struct sg_light *light, const struct sg_reading *reading, const uint8_t order[6],
-                   struct sg_light_pass *pass)
-{
-    for (uint8_t k = 0; k < SG_LIGHT_CHANNELS; k++) {
-        sg_light_one(light, reading, sg_rom_byte(order + k, SG_ROM_FLASH), pass);
-        if (k & 1U)
-            pass->brought_q5 = 0, pass->lit_code = pass->unlit_code = 0;
-    }
-}
-
 uint16_t sg_light_log2_q12(uint16_t x)
 {
     uint8_t octave = 15;
@@ -186,15 +179,82 @@ uint16_t sg_light_log2_q12(uint16_t x)
         x = (uint16_t)(x << 8);
         octave = 7;
     }
-    while (!(x & 0x8000U)) {
+    for (; !(x & 0x8000U); octave--)
         x = (uint16_t)(x << 1);
-        octave--;
-    }
     // 1.xxxxxx|yyyyyyyyy: six bits choose the entry, eight more interpolate. Neighbours differ by at most 92.
     const uint16_t *entry = &sg_light_log2_table[(uint8_t)(x >> 9) & 63U];
     const uint8_t fraction = (uint8_t)(x >> 1);
     const uint16_t here = sg_rom_word(entry);
     const uint8_t rise = (uint8_t)(sg_rom_word(entry + 1) - here);
     return (uint16_t)(((uint16_t)octave << 12) + here + (uint8_t)((uint16_t)(rise * fraction + 128U) >> 8));
+}
+
+uint16_t sg_light_feature(struct sg_light_channel *channel)
+{
+    const uint8_t n = channel->cycles;
+    const int32_t least = (int32_t)(uint16_t)(SG_LIGHT_STARVED_CODES * SG_LIGHT_UNIT * n);
+    int32_t sum = channel->sum_q5, value = channel->unit_q12;
+    if (sum < least) {
+        sum = least;
+        channel->flags |= SG_LIGHT_STARVED;
+    }
+    for (; sum > UINT16_MAX; sum >>= 1)
+        value += 4096;
+    value += (int32_t)sg_light_log2_q12((uint16_t)sum) - sg_light_log2_q12(n);
+    return value < 0 ? 0 : value > UINT16_MAX ? UINT16_MAX : (uint16_t)value;
+}
+
+// What is rare at the start of a cycle: earlier codes that are none.
+void sg_light_prepare(struct sg_light *light, const struct sg_reading *reading)
+{
+    for (uint8_t i = 0; i < SG_LIGHT_CHANNELS; i++) {
+        struct sg_light_channel *channel = &light->channel[i];
+        const uint8_t gap = light->fresh & SG_LIGHT_FRESH_GAP;
+        channel->unlit_q5[0] = channel->unlit_q5[1] = gap ? sg_light_q5(reading->unlit_code[i]) : channel->mean_q5;
+    }
+    light->fresh = 0;
+}
+
+#ifndef SG_LIGHT_ASSEMBLY
+void sg_light_add(struct sg_light *light, const struct sg_reading *reading)
+{
+    struct sg_light_pass pass = { .brought_q5 = (int16_t)sg_light_q5(reading->held_code),
+                                  .lit_code = reading->held_code };
+    if (light->fresh)
+        sg_light_prepare(light, reading);
+    if (light->moving > SG_LIGHT_MOVING_FROM)
+        pass.moving_q8 = (uint16_t)(light->moving - SG_LIGHT_MOVING_FROM) >> 2;
+    const uint8_t *order = sg_light_order[light->wiring];
+    for (uint8_t k = 0; k < SG_LIGHT_CHANNELS; k++) {
+        sg_light_one(light, reading, sg_rom_byte(order + k, SG_ROM_FLASH), &pass);
+        if (k & 1U) {
+            pass.brought_q5 = 0;
+            pass.lit_code = pass.unlit_code = 0;
+        }
+    }
+    // Six channels depart together, noise does not.
+    uint8_t size = SG_LIGHT_DEPARTURE_MOST;
+    if (pass.departure > -SG_LIGHT_DEPARTURE_MOST && pass.departure < SG_LIGHT_DEPARTURE_MOST)
+        size = (uint8_t)(pass.departure < 0 ? -pass.departure : pass.departure);
+    uint16_t moving = (uint16_t)(light->moving - (light->moving >> 4) + (uint16_t)(size * size));
+    if (moving > SG_LIGHT_MOVING_MOST)
+        moving = SG_LIGHT_MOVING_MOST;
+    if (moving > SG_LIGHT_MOVING_FROM && light->moving <= SG_LIGHT_MOVING_FROM)
+        light->fresh |= SG_LIGHT_FRESH_MOVING;
+    light->moving = moving;
+}
+
+uint8_t sg_light_features(struct sg_light *light, uint16_t feature[6])
+{
+    uint8_t flags = 0;
+    for (uint8_t i = 0; i < SG_LIGHT_CHANNELS; i++) {
+        struct sg_light_channel *channel = &light->channel[i];
+        if (channel->cycles != 0) {
+            feature[i] = sg_light_feature(channel);
+            channel->cycles = 0;
+        }
+        flags |= channel->flags;
+    }
+    return flags;
 }
 #endif

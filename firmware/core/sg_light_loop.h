@@ -13,7 +13,13 @@ enum {
     SG_LIGHT_SETTLED = 16,              // the mean of unlit codes follows by 1/16 from then on
     SG_LIGHT_STEP_Q5 = 4 * 32,          // five times the noise: what rested has moved
     SG_LIGHT_LEAP_Q5 = 32 * 32,         // of which nobody knows whether the lit exposure saw it
-    SG_LIGHT_MOVING_FULL = 256,
+    // Mean square of what six channels depart together: noise alone is 256.
+    SG_LIGHT_MOVING_FROM = 768,
+    SG_LIGHT_MOVING_FULL = 256,         // in sg_light_pass.moving_q8: 4 * 256 above
+    SG_LIGHT_MOVING_MOST = 4096,
+    SG_LIGHT_DEPARTURE_MOST = 63,
+    SG_LIGHT_FRESH_GAP = 1,
+    SG_LIGHT_FRESH_MOVING = 2,
     SG_LIGHT_UNIT = 32,
 };
 
@@ -26,21 +32,38 @@ struct sg_light_pass {
     uint16_t moving_q8;         // how much of the interpolation to believe, 256 and above: all
 };
 
-// Add one channel's codes.
-void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint8_t i, struct sg_light_pass *pass);
-
-// Add all six, in the order of `order`: first and second of three pairs, in program memory.
-void sg_light_loop(struct sg_light *light, const struct sg_reading *reading, const uint8_t order[6],
-                   struct sg_light_pass *pass);
+// The assembly knows these places.
+_Static_assert(sizeof(struct sg_light_channel) == 20 && offsetof(struct sg_light_channel, exposure_cycles) == 4
+               && offsetof(struct sg_light_channel, unit_q12) == 6 && offsetof(struct sg_light_channel, unlit_q5) == 8
+               && offsetof(struct sg_light_channel, mean_q5) == 12 && offsetof(struct sg_light_channel, slope_q16) == 14
+               && offsetof(struct sg_light_channel, settled) == 16 && offsetof(struct sg_light_channel, cycles) == 17
+               && offsetof(struct sg_light_channel, flags) == 18, "channel layout");
+_Static_assert(offsetof(struct sg_light, before_q8) == 120 && offsetof(struct sg_light, earlier_q8) == 121
+               && offsetof(struct sg_light, moving) == 122 && offsetof(struct sg_light, wiring) == 124
+               && offsetof(struct sg_light, fresh) == 125, "layout");
+_Static_assert(offsetof(struct sg_reading, held_code) == 48 && offsetof(struct sg_reading, unlit_code) == 12 && offsetof(struct sg_reading, exposure_cycles) == 24
+               && offsetof(struct sg_reading, late_lit_cycles) == 36
+               && offsetof(struct sg_reading, late_unlit_cycles) == 42, "reading layout");
 
 // 4096 * log2(1 + i / 64), in program memory.
 extern const uint16_t sg_light_log2_table[65];
 
-// floor(4096 * log2(x)), within 1; x in 1..65535.
+// 4096 * log2(x), x in 1..65535: rounded, at most 1.5 off.
 uint16_t sg_light_log2_q12(uint16_t x);
 
-// What is known of a channel's ambient light is this code and no more.
-void sg_light_settle(struct sg_light_channel *channel, uint16_t unlit_q5);
+// Add one channel's codes.
+void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint8_t i, struct sg_light_pass *pass);
+
+// Feature of the cycles added to a channel, at least one; sets STARVED. The cycles stay.
+uint16_t sg_light_feature(struct sg_light_channel *channel);
+
+// Make up the earlier unlit codes that light->fresh says are none.
+void sg_light_prepare(struct sg_light *light, const struct sg_reading *reading);
+
+// Channels in the order of sampling, by wiring, in program memory: six LEDs, or six photodiodes.
+extern const uint8_t sg_light_order[2][6];
+
+// The twins themselves are sg_light_add and sg_light_features.
 
 // 1/32 of a code.
 static inline uint16_t sg_light_q5(uint16_t code)

@@ -3,10 +3,6 @@
 #ifndef SG_LIGHT_TABLE_H
 #define SG_LIGHT_TABLE_H
 
-#include <stdint.h>
-
-#include "sg_rom.h"
-
 // Feature of 1/32 code collected in 1 cycle.
 #define UNIT_Q12 35078L
 
@@ -20,14 +16,12 @@
 // Share of the sample capacitor in the capacitance at rest, Q0.16.
 #define SHARE_Q16 20834
 
-// Weights of earlier unlit codes by period, nearest of every 2048 cycles from 15984: b and
-// -c of sg_light.h, Q0.8.
-enum { PERIOD_FROM = 15984, PERIOD_BITS = 11, PERIOD_NODES = 9 };
-static const uint8_t before_q8[9] SG_ROM = {
-    76, 75, 75, 74, 73, 72, 71, 70, 69,
-};
-static const uint8_t earlier_minus_q8[9] SG_ROM = {
-    19, 20, 20, 21, 22, 23, 24, 25, 26,
-};
+// Weights of earlier unlit codes by period, nearest of every 2048 cycles from 15984 on: b
+// and -c of sg_light.h, Q0.8.
+#define PERIOD_FROM 15984U
+#define PERIOD_BITS 11
+#define PERIOD_NODES 9
+#define BEFORE_Q8 { 76, 75, 75, 74, 73, 72, 71, 70, 69 }
+#define EARLIER_MINUS_Q8 { 19, 20, 20, 21, 22, 23, 24, 25, 26 }
 
 #endif

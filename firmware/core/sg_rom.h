@@ -20,6 +20,11 @@ enum sg_rom_space { SG_ROM_MEMORY = 0, SG_ROM_FLASH = 1 };
 #define SG_MLP_ASSEMBLY
 #endif
 
+// The same of sg_light.
+#if defined(__AVR__) && !defined(SG_LIGHT_PORTABLE)
+#define SG_LIGHT_ASSEMBLY
+#endif
+
 #ifdef __AVR__
 #include <avr/pgmspace.h>
 #define SG_ROM PROGMEM
