@@ -60,6 +60,8 @@ struct app_live {
     uint16_t limit_cycles[HAL_CHANNELS];    // of automatic exposure
     uint16_t rate_hz;                   // wanted; 0: as fast as can be
     int8_t curve_q10[HAL_CHANNELS];
+    int8_t zero_q2;
+    uint8_t reserved;
     uint8_t repeats;
     uint8_t wiring;
     uint8_t power;

@@ -89,15 +89,16 @@ SELDOM static int8_t exposure(struct sg_exposure *io)
 
 SELDOM static int8_t curve(struct sg_curve *io)
 {
-    if (io->op > SG_SETTINGS_SET)
+    if (io->op > SG_SETTINGS_SET || io->zero_q2 > 0)
         return SG_E_ARG;
     if (io->op == SG_SETTINGS_SET) {
         memcpy(app_live.curve_q10, io->curve_q10, sizeof app_live.curve_q10);
+        app_live.zero_q2 = io->zero_q2;
         app_live_changed();
         sg_light_curve(&app.light, app_live.curve_q10);
     }
     memcpy(io->curve_q10, app_live.curve_q10, sizeof io->curve_q10);
-    io->reserved = 0;
+    io->zero_q2 = app_live.zero_q2;
     return SG_OK;
 }
 

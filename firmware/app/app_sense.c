@@ -143,14 +143,19 @@ SELDOM static void exposures_moved(void)
     app_count(&app.exposure_changes);
 }
 
+static uint8_t first(uint8_t i)
+{
+    return sg_rom_byte(&before[timing.wiring][i], SG_ROM_FLASH);
+}
+
 static void look_at(const struct sg_reading *reading)
 {
     struct sg_health_sight sight;
     const uint8_t i = look;
-    const uint8_t first = sg_rom_byte(&before[timing.wiring][i], SG_ROM_FLASH);
+    const uint8_t pair = first(i);
     sight.lit_code = reading->lit_code[i];
     sight.unlit_code = reading->unlit_code[i];
-    sight.before_code = first < HAL_CHANNELS ? reading->lit_code[first] : 0;
+    sight.before_code = pair < HAL_CHANNELS ? reading->lit_code[pair] : 0;
     sight.exposure_cycles = reading->exposure_cycles[i];
     sight.most_cycles = hal_exposure_most(i);
     sight.feature = app.feature[i];
@@ -189,8 +194,11 @@ SELDOM int8_t app_probe(uint8_t emitter, uint16_t seq)
 SELDOM static void probed(void)
 {
     struct sg_probe *probe = &app_body.probe;
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        probe->feature[i] = app.light.channel[i].flags & SG_LIGHT_STARVED ? 0 : app.feature[i];
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+        // What emits does not sense, and leaves its 5 V on the sample capacitor for the one sampled next.
+        const uint8_t blind = timing.wiring == SG_WIRING_LEDS && (i == app.probe || first(i) == app.probe);
+        probe->feature[i] = blind || (app.light.channel[i].flags & SG_LIGHT_STARVED) ? 0 : app.feature[i];
+    }
     probe->emitter = app.probe;
     probe->reserved = 0;
     // Not queued only while the line is full of answers: again after the next cycle.

@@ -94,14 +94,10 @@ void app_on_byte(uint8_t byte, uint32_t zero_us)
 // Compared with the frame before, as sensed.
 static uint8_t exposures_changed(const struct sg_reading *reading)
 {
-    uint8_t changed = 0;
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-        if (reading->exposure_cycles[i] != previous_exposure[i]) {
-            previous_exposure[i] = reading->exposure_cycles[i];
-            changed = SG_FLAG_EXPOSURE;
-        }
-    }
-    return changed;
+    if (memcmp(previous_exposure, reading->exposure_cycles, sizeof previous_exposure) == 0)
+        return 0;
+    memcpy(previous_exposure, reading->exposure_cycles, sizeof previous_exposure);
+    return SG_FLAG_EXPOSURE;
 }
 
 NOT_KEPT static void send_raw(struct sg_raw *raw, const struct sg_model_view *model, const struct sg_affine *recentre)

@@ -470,10 +470,20 @@ sg_gp_trend:
 #define shifts r23
 #define mask r24
 #define out r25
-.macro rounded at
-    ldd r18, Z+\at
-    ldd r19, Z+\at+1
-    ldd r20, Z+\at+2
+    .section .text.sg_gp_round, "ax", @progbits
+    .global sg_gp_round
+    .type sg_gp_round, @function
+sg_gp_round:
+    movw r26, r20
+    movw r30, r24
+    clr out
+    ldi r18, 2                  ; azimuth, elevation
+    mov r1, r18
+3:
+    ld r18, Z
+    ldd r19, Z+1
+    ldd r20, Z+2
+    adiw r30, 4
     mov r21, r20                ; sign
     lsl r21
     sbc r21, r21
@@ -517,17 +527,8 @@ sg_gp_trend:
     eor r20, r18
     st X+, r19
     st X+, r20
-.endm
-
-    .section .text.sg_gp_round, "ax", @progbits
-    .global sg_gp_round
-    .type sg_gp_round, @function
-sg_gp_round:
-    movw r26, r20
-    movw r30, r24
-    clr out
-    rounded 0
-    rounded 4
+    dec r1                      ; ends as zero, as the compiler wants it
+    brne 3b
     mov r24, out
     andi r24, 4                 ; SG_GP_OUT_OF_RANGE
     ret

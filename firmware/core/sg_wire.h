@@ -238,11 +238,12 @@ struct sg_settings {
     uint8_t lights;             // 0: off, until set again
 };
 
-// Curvature of each channel's charge over its code: charge = code * (1 + curve * code / 1024), curve in 1/1024.
+// Curvature of each channel's charge over its code, beside the nominal one: charge = code * (1 + ... + curve * code
+// / 1024), curve in 1/1024. And the converter's zero: the code that 0 V would have, if codes went below 0.
 struct sg_curve {
     int8_t curve_q10[6];
+    int8_t zero_q2;             // quarter codes, 0 or less
     uint8_t op;                 // enum sg_settings_op
-    uint8_t reserved;
 };
 
 struct sg_probe {

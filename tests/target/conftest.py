@@ -9,11 +9,12 @@ import pytest
 from sparsegaze import wire
 from sparsegaze.device import Device
 from sparsegaze.mapfile import synthetic_map
-from sparsegaze.model import CHANNELS, SLOT_BYTES, DeviceModel
+from sparsegaze.model import CHANNELS, DeviceModel
 from sparsegaze.trust import Trust
 
 FLASH_BYTES = 32768
-SLOT_BASE = (0x6000, 0x6C00)
+SLOT_BASE = (0x6800, 0x7000)
+NANO_SLOT_BYTES = 2048
 
 
 def random_model(vectors, seed=0, generation=1, channels=CHANNELS):
@@ -64,7 +65,7 @@ def put_models(state_dir, images):
     """Prepare the flash in `state_dir` for a virtual Nano: {slot: image bytes}, the rest erased."""
     flash = bytearray(b"\xff" * FLASH_BYTES)
     for slot, image in images.items():
-        assert len(image) <= SLOT_BYTES
+        assert len(image) <= NANO_SLOT_BYTES
         flash[SLOT_BASE[slot]:SLOT_BASE[slot] + len(image)] = image
     state_dir.mkdir(parents=True, exist_ok=True)
     (state_dir / "flash.bin").write_bytes(flash)

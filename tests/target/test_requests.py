@@ -34,9 +34,9 @@ def test_hello_says_what_the_board_is(board):
     hello = device.hello
     assert (hello.wire_version, hello.model_version) == (lib.SG_WIRE_VERSION, lib.SG_MODEL_VERSION)
     assert hello.board == lib.SG_BOARD_NANO328P and hello.channels == 6 and hello.cpu_hz == 16_000_000
-    assert hello.slot_base == (0x6000, 0x6C00) and hello.slot_bytes == lib.SG_MODEL_SLOT_BYTES
+    assert hello.slot_base == (0x6800, 0x7000) and hello.slot_bytes == 2048
     assert hello.page_bytes == 128 and hello.frame_period_us == 999
-    assert hello.trial_bytes == 640
+    assert hello.trial_bytes == 0
     assert 0 < hello.exposure_min_us < hello.exposure_max_us <= 326
 
 
@@ -87,7 +87,7 @@ def test_longer_body_is_accepted_and_its_excess_ignored(board, kind):
     (lib.SG_MSG_TRIAL_USE, b"\x02", lib.SG_E_ARG),
     (lib.SG_MSG_EXPOSURE, bytes(12) + b"\x05\0", lib.SG_E_ARG),
     (lib.SG_MSG_RECENTRE, bytes(8) + b"\x03\0", lib.SG_E_ARG),
-    (lib.SG_MSG_CURVE, bytes(6) + b"\x02\0", lib.SG_E_ARG),
+    (lib.SG_MSG_CURVE, bytes(7) + b"\x02", lib.SG_E_ARG), (lib.SG_MSG_CURVE, bytes(6) + b"\1\1", lib.SG_E_ARG),
     (lib.SG_MSG_SETTINGS, bytes(8) + b"\x02" + bytes(5), lib.SG_E_ARG),
     (lib.SG_MSG_PROBE, b"\x06", lib.SG_E_ARG),
     (lib.SG_MSG_RECENTRE, bytes(8) + b"\x01\0", lib.SG_E_STATE),
@@ -95,9 +95,9 @@ def test_longer_body_is_accepted_and_its_excess_ignored(board, kind):
     (lib.SG_MSG_MODEL_READ, b"\0\0\x03\1", lib.SG_E_ARG),
     (lib.SG_MSG_MODEL_READ, b"\0\0\x00\0", lib.SG_E_ARG),
     (lib.SG_MSG_MODEL_READ, b"\0\0\x00\x31", lib.SG_E_ARG),
-    (lib.SG_MSG_MODEL_READ, b"\xd1\x0b\x00\x30", lib.SG_E_BOUNDS),      # 3025 + 48 > 3072
+    (lib.SG_MSG_MODEL_READ, b"\xd1\x07\x00\x30", lib.SG_E_BOUNDS),      # 2001 + 48 > 2048
     (lib.SG_MSG_MODEL_READ, b"\xff\xff\x00\x01", lib.SG_E_BOUNDS),
-    (lib.SG_MSG_MODEL_READ, b"\x80\x02\x02\x01", lib.SG_E_BOUNDS),      # 640: one beyond the trial
+    (lib.SG_MSG_MODEL_READ, b"\x80\x02\x02\x01", lib.SG_E_BOUNDS),      # no room for a trial
     (lib.SG_MSG_TRIAL_WRITE, b"\x80\x02\x02\x01x", lib.SG_E_BOUNDS),
     (lib.SG_MSG_TRIAL_WRITE, b"\xff\xff\x02\x01x", lib.SG_E_BOUNDS),
     (lib.SG_MSG_TRIAL_WRITE, b"\0\0\x00\x01x", lib.SG_E_ARG),           # flash is not written by requests
@@ -210,7 +210,7 @@ def test_answers_survive_a_flood_and_dropped_frames_are_counted(board):
 
 
 def test_a_second_verification_at_once_is_refused_busy_and_the_first_answered(board):
-    _, device = board(models={0: random_model(216).image})
+    _, device = board(models={0: random_model(140).image})
     body = wire.body("struct sg_model_at", slot=0)
     kind = lib.SG_MSG_MODEL_VERIFY
     packets = exchange(device, wire.encode(kind, 1, body) + wire.encode(kind, 2, body), 0.2)

@@ -107,7 +107,7 @@ def test_settings_that_do_not_exist_are_refused_and_change_nothing(board, field,
 
 
 def test_a_rate_beyond_the_limit_is_the_limit(board):
-    _, device = board(models={0: random_model(216).image})
+    _, device = board(models={0: random_model(140).image})
     device.set_stream(gaze=True)
     now = device.settings(rate_hz=1000)
     assert 300 < now.rate_limit_hz < 450 and now.rate_hz == now.rate_limit_hz
@@ -116,7 +116,7 @@ def test_a_rate_beyond_the_limit_is_the_limit(board):
     calm(device)
 
 
-def test_the_limit_follows_model_and_streams_and_the_wish_is_kept(board):
+def test_the_limit_follows_the_streams_and_the_line_and_the_wish_is_kept(board):
     _, device = board(models={0: random_model(64).image})
     device.settings(rate_hz=900)
     limit = {}
@@ -126,19 +126,13 @@ def test_the_limit_follows_model_and_streams_and_the_wish_is_kept(board):
         limit[len(streams)] = now.rate_limit_hz
         assert now.rate_hz == min(900, now.rate_limit_hz)
     assert limit[0] > limit[1] > limit[2] > limit[3] > 300
-    device.trial(random_model(10, seed=3).image)
-    device.set_stream(gaze=True)
-    assert device.settings().rate_limit_hz == 1001 and device.settings().rate_hz == 900
-    device.trial(None)
-    assert device.settings().rate_hz == limit[1]
-    device.set_stream(raw=True, gaze=True, counts=True)
     device.set_baud(500_000)
     assert device.settings().rate_limit_hz < min(limit[3], 430)
     collect(device, 200)
     calm(device)
 
 
-@pytest.mark.parametrize("vectors", [0, 1, 30, 64, 216])
+@pytest.mark.parametrize("vectors", [0, 1, 30, 64, 140])
 def test_no_frame_is_late_with_any_model_streams_and_repeats(board, vectors):
     """The estimate of the work of a frame is above what it takes, and not far above."""
     models = {0: costly_model([42000] * 6, vectors).image} if vectors else None
@@ -206,16 +200,15 @@ def test_a_probe_lights_one_emitter_alone_and_all_is_as_before_afterwards(board)
     before = device.exposure(us=[100] * 6)
     device.set_stream(raw=True)
     seen = collect(device, 20)
-    partner = {0: 5, 5: 0, 1: 4, 4: 1, 2: 3, 3: 2}
+    next_sampled = {5: 0, 1: 4, 2: 3}           # what the emitter's 5 V on the sample capacitor would spoil
     for emitter in range(6):
         nano.control.counters_clear()
         found = device.probe(emitter)
         counters = nano.control.counters()
         lit = [counters[f"lit_cycles_{i}"] for i in range(6)]
         assert max(lit) == lit[emitter] and found.emitter == emitter
-        # What lights does not sense meanwhile, nor does the one that shares its time.
-        assert found.feature[emitter] == found.feature[partner[emitter]] == 0
-        assert all(found.feature[i] > 0 for i in range(6) if i not in (emitter, partner[emitter]))
+        blind = {emitter, next_sampled.get(emitter, emitter)}
+        assert {i for i in range(6) if found.feature[i] == 0} == blind
     seen = [frame for frame in collect(device, 400)]
     gaps = [b.seq - a.seq for a, b in zip(seen, seen[1:])]
     assert gaps[-100:] == [1] * 100
