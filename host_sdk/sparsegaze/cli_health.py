@@ -125,8 +125,9 @@ def linearity(port, as_json):
     ]
     head = ["sensor", "shift before", "octaves", "after", "octaves", "noise", "curve"]
     said = "the curves are stored" if done.kept else "the new curves were no better: the old ones stay"
-    lines = [*table(head, rows), "", said]
-    moved = done.kept and abs(done.curve - done.old).max() > 0.004
+    zero = f"the converter's zero: {done.old_zero:+.2f} -> {done.zero:+.2f} codes"
+    lines = [*table(head, rows), zero, "", said]
+    moved = done.kept and (abs(done.curve - done.old).max() > 0.004 or abs(done.zero - done.old_zero) > 0.5)
     if modelled and moved:
         lines.append(f"the stored model was made with other curves: run `sparsegaze calibrate {port}` again")
     console.result({**done.report(), "calibrate_again": bool(modelled and moved)}, *lines)
@@ -159,6 +160,7 @@ def probe(port, reference, headset, save, as_json):
     """
     import numpy as np
 
+    from . import faults
     from . import probe as module
     from .device import Device
 
@@ -169,6 +171,7 @@ def probe(port, reference, headset, save, as_json):
     with Device(port) as device:
         with console.progress() as progress:
             measured = module.measure(device, progress=progress)
+        dead = [fault for fault in faults.of(device.status(), port) if fault.name in ("open", "short")]
     if save:
         module.save(save, measured)
     found = module.compare(measured, against, stored=bool(reference))
@@ -178,12 +181,15 @@ def probe(port, reference, headset, save, as_json):
         for i, row in enumerate(measured)
     ]
     lines = table(["", *(f"A{j} lit" for j in range(6))], rows) + [""]
-    lines += [line for text, remedy in found.findings for line in (text, f"  -> {remedy}")] or [
+    # What the board knows of a dead part is better than what the matrix makes of it.
+    findings = [row for row in found.findings if not any(f"LED {fault.channel} " in row[0] for fault in dead)]
+    findings += [(fault.text, fault.remedy) for fault in dead]
+    lines += [line for text, remedy in findings for line in (text, f"  -> {remedy}")] or [
         f"all six LEDs are where they belong (misfit {found.misfit_octaves:.2f} octaves)"
     ]
     data = {
-        "ok": not found.findings,
-        "findings": [{"text": text, "remedy": remedy} for text, remedy in found.findings],
+        "ok": not findings,
+        "findings": [{"text": text, "remedy": remedy} for text, remedy in findings],
         "probe": measured,
         "place": found.place,
         "sensor_octaves": found.sensor,
@@ -192,7 +198,7 @@ def probe(port, reference, headset, save, as_json):
         "saved": save,
     }
     console.result(data, *lines)
-    return 1 if found.findings else 0
+    return 1 if findings else 0
 
 
 def _octaves(value):

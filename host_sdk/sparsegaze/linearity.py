@@ -2,10 +2,11 @@
 """Self-calibration of linearity: the same light must give the same photocurrent, however long the exposure.
 
 A node's capacitance changes with its voltage, so charge is not quite proportional to the converter's code:
-charge = code (1 + c code / 1024), with a c of its own for every part. Exposures alternate quickly between the
+charge = code (1 + c code / 1024), with a c of its own for every part; and a converter that would read less
+than 0 at 0 V reads too few codes lit and cannot say so unlit. Exposures alternate quickly between the
 automatic ones and fractions of these; a short one lies between two long ones, whose readings are interpolated
-to its time, so that light which drifts (an eye, a pupil) cancels. What is left comes from c, which is fitted
-by least squares.
+to its time, so that light which drifts (an eye, a pupil) cancels. What is left comes from c and from that
+zero, which are fitted by least squares.
 """
 
 from typing import NamedTuple
@@ -32,6 +33,7 @@ STEADY_SHARE = 0.5  # of the short exposures that must be usable
 AMBIENT_MOVE = 0.15  # of our own light: more, and the light was not steady
 AGAIN_SHARE, AGAIN_CURVE = 0.3, 0.006  # a second measurement must find the curve again this well
 CURVE_STEPS = 127
+DARK_CODES = 2.0  # unlit: fewer, and the converter's zero may hide behind 0
 NOMINAL = 0.05  # the curve that the firmware takes off for every part, to first order
 
 
@@ -67,7 +69,8 @@ class Linearity(NamedTuple):
 
     before, after   measured shifts, octaves; noise of each, octaves
     old, curve      the curves before and now; kept: the new ones are stored (False: they were no better)
-    codes           of our light at the automatic exposures;  offset_codes  that it reads more than it is
+    codes           of our light at the automatic exposures
+    old_zero, zero  of the converter, codes, before and now; a number, 0 or less
     """
 
     before: np.ndarray
@@ -77,7 +80,8 @@ class Linearity(NamedTuple):
     curve: np.ndarray
     kept: bool
     codes: np.ndarray
-    offset_codes: np.ndarray
+    old_zero: float
+    zero: float
 
     def report(self):
         """Plain numbers."""
@@ -91,7 +95,8 @@ class Linearity(NamedTuple):
             "shift_percent_after": percent(self.after),
             "noise_octaves": self.noise,
             "codes": self.codes,
-            "offset_codes": self.offset_codes,
+            "zero_codes_before": self.old_zero,
+            "zero_codes": self.zero,
         }
 
 
@@ -109,8 +114,8 @@ def run(device, progress=None):
     """
     faults.refuse(device)
     settings, exposure = device.settings(), device.exposure()
-    old = np.array(device.curve().curve)
-    stored = False
+    stored = device.curve()
+    old, changed = np.array(stored.curve), False
     if settings.repeats != 1 or settings.rolling:
         device.settings(repeats=1, rolling=False)   # the counts are of a frame's last cycle
     try:
@@ -121,22 +126,22 @@ def run(device, progress=None):
         holds = measure(device, long_us, ROUNDS, say)
         check_steady(holds)
         first = fit(holds, old)
-        device.curve(first.curve)
-        stored = True
+        zero = _zero_of(first, holds, stored.zero_codes)
+        device.curve(first.curve, zero)
+        changed = True
         again = measure(device, long_us, CHECK_ROUNDS, lambda part: say(ROUNDS + part))
         check_steady(again)
         second = fit(again, np.array(device.curve().curve))
         noise = np.hypot(first.noise_octaves, second.noise_octaves)
         kept = _confirmed(first, second, old, noise)
-        stored = not kept
+        changed = not kept
         codes = np.mean([hold.lit - hold.unlit for hold in holds if hold.full], axis=0)
-        now = first.curve if kept else old
-        return Linearity(
-            first.shift_octaves, second.shift_octaves, noise, old, now, kept, codes, first.offset_codes
-        )
+        shifts = first.shift_octaves, second.shift_octaves
+        now = (first.curve, zero) if kept else (old, stored.zero_codes)
+        return Linearity(*shifts, noise, old, now[0], kept, codes, stored.zero_codes, now[1])
     finally:
-        if stored:
-            device.curve(old)
+        if changed:
+            device.curve(old, stored.zero_codes)
         if exposure.automatic:
             device.exposure(auto=True)
         else:
@@ -144,6 +149,15 @@ def run(device, progress=None):
         if settings.repeats != 1 or settings.rolling:
             device.settings(repeats=settings.repeats, rolling=settings.rolling)
         device.set_stream()
+
+
+def _zero_of(found, holds, old):
+    """The converter's zero in quarters of a code, by sensors whose unlit codes stop at 0; else as it was."""
+    unlit = np.mean([hold.unlit for hold in holds if hold.full], axis=0)
+    dark = unlit < DARK_CODES
+    if dark.sum() < 2:
+        return old
+    return float(np.clip(np.round(4 * (old + np.median(found.offset_codes[dark]))) / 4, -32.0, 0.0))
 
 
 def _confirmed(first, second, old, noise):
@@ -181,9 +195,8 @@ def fit(holds, curve):
     """Least-squares curve of every channel from Holds measured with `curve` [6] in force. Returns Fit.
 
     d = log2 of the short exposure's photocurrent over the long one's, which lies around it. The true curve c
-    would have made nothing of it but noise: charge goes by 1 + c x, x = (lit + unlit) / 1024 codes. An unlit
-    code cannot fall below 0, nor say how far below it the converter's zero is: so a constant number of codes,
-    which weighs most in short exposures, is fitted beside c, or c would take it for curvature.
+    would have made nothing of it but noise: charge goes by 1 + c x, x = (lit + unlit) / 1024 codes. What the
+    converter's zero takes away is a constant number of codes, which weighs most in short exposures.
     Raises CalibrationError when too few of the exposures are usable.
     """
     curve = np.asarray(curve, float)

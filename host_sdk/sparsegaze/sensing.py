@@ -69,18 +69,23 @@ class Sensing:
         return self._exchange.request(lib.SG_MSG_SETTINGS, wire.body("struct sg_settings", **fields),
                                       Settings)
 
-    def curve(self, curve=None):
-        """Curve: each channel's curvature, charge = code (1 + curve code / 1024), after storing six new ones.
+    def curve(self, curve=None, zero_codes=None):
+        """Curve: each channel's curvature, charge = code (1 + curve code / 1024), and the converter's zero.
 
-        curve   six numbers of -0.125 to 0.124, rounded to 1/1024; None: leave them
+        curve        six numbers of -0.125 to 0.124 to store, rounded to 1/1024; None: leave them
+        zero_codes   -32 to 0, rounded to 1/4: what the converter would read at 0 V; None: leave it
         Raises ValueError when one does not fit.
         """
-        if curve is None:
-            return self._exchange.request(lib.SG_MSG_CURVE, wire.body("struct sg_curve"), Curve)
-        steps = [int(round(1024 * value)) for value in curve]
+        now = self._exchange.request(lib.SG_MSG_CURVE, wire.body("struct sg_curve"), Curve)
+        if curve is None and zero_codes is None:
+            return now
+        steps = now.curve_q10 if curve is None else [int(round(1024 * value)) for value in curve]
+        zero = now.zero_q2 if zero_codes is None else int(round(4 * zero_codes))
         if len(steps) != lib.SG_WIRE_CHANNELS or min(steps) < -128 or max(steps) > 127:
             raise ValueError(f"curves are {lib.SG_WIRE_CHANNELS} numbers of -0.125 to 0.124")
-        body = wire.body("struct sg_curve", op=lib.SG_SETTINGS_SET, curve_q10=steps)
+        if not -128 <= zero <= 0:
+            raise ValueError(f"a converter's zero is -32 to 0 codes, not {zero_codes}")
+        body = wire.body("struct sg_curve", op=lib.SG_SETTINGS_SET, curve_q10=list(steps), zero_q2=zero)
         return self._exchange.request(lib.SG_MSG_CURVE, body, Curve)
 
     def probe(self, emitter):

@@ -168,6 +168,11 @@ class Curve(record("struct sg_curve", "Curve")):
         """charge = code (1 + curve code / 1024), six numbers."""
         return tuple(value / 1024 for value in self.curve_q10)
 
+    @property
+    def zero_codes(self):
+        """What the converter would read at 0 V if it could read below 0: codes, 0 or less."""
+        return self.zero_q2 / 4
+
 
 class Probe(record("struct sg_probe", "Probe")):
     """Every sensor's light from one emitter alone; struct sg_probe."""

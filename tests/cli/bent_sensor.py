@@ -42,7 +42,8 @@ class BentSensor(FakeDevice):
         rate = self.light * FULL * np.exp2((np.asarray(signal) - MIDDLE) / 4096)
         around = self.ambient(self.t_us)
         lit, unlit = (self._code((ours + around) * exposure) for ours in (rate, 0.0))
-        ours = lit - unlit
+        # The device takes the stored zero where unlit codes say nothing of it.
+        ours = lit - np.where(unlit < 2, unlit + np.minimum(self.zero_q2 / 4, 0), unlit)
         bend = NOMINAL + np.array(self.curves) / 1024
         charge = ours * (1 + bend * (lit + unlit) / 1024)
         with np.errstate(all="ignore"):

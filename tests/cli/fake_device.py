@@ -149,7 +149,7 @@ class FakeDevice:
         self.fault, self.alarm, self.supply_mv = tuple(fault), alarm, supply_mv
         self.sensing = {"rate_hz": 0, "repeats": 1, "wiring": 0, "power": 0, "rolling": 0, "lights": 1}
         self.exposures, self.automatic, self.limits = (800,) * 6, True, None     # 1/16 us
-        self.curves = (0,) * 6                                                   # 1/1024
+        self.curves, self.zero_q2 = (0,) * 6, 0                                  # 1/1024; 1/4 code
         self.clock = SimpleNamespace(drift=0.0)
         self.affine = wire.affine((0, 0))
         self.stream, self.lost, self.bad, self.incomplete = [], 0, 0, 0
@@ -236,11 +236,14 @@ class FakeDevice:
             self._changed()
         return Exposure(self.exposures, lib.SG_EXPOSURE_AUTO if self.automatic else lib.SG_EXPOSURE_HOLD, 0)
 
-    def curve(self, curve=None):
+    def curve(self, curve=None, zero_codes=None):
         if curve is not None:
             self.curves = tuple(int(round(1024 * v)) for v in curve)
+        if zero_codes is not None:
+            self.zero_q2 = int(round(4 * zero_codes))
+        if curve is not None or zero_codes is not None:
             self._changed()
-        return Curve(self.curves, 0, 0)
+        return Curve(self.curves, self.zero_q2, 0)
 
     def probe(self, emitter):
         column = [None] * 6 if self.see is None else [row[emitter] for row in self.see]

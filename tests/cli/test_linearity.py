@@ -21,7 +21,7 @@ def drift(t_us):
 
 def unchanged(device):
     """Curves, exposures and settings are as they were."""
-    assert device.curves == (0,) * 6 and device.automatic and device.sensing["repeats"] == 1
+    assert device.curves == (0,) * 6 and device.zero_q2 == 0 and device.automatic and device.sensing["repeats"] == 1
     assert device.stream[-1] == (False, False, False)
 
 
@@ -41,10 +41,21 @@ def test_finds_every_curve_and_takes_the_shift_away(wander, ambient):
 
 @pytest.mark.parametrize("zero", [-2.0, 2.0])
 def test_a_converter_whose_zero_is_off_is_not_taken_for_curvature(zero):
-    found = linearity.run(BentSensor(BEND, wander=drift, zero=zero, frame_us=1999))
+    device = BentSensor(BEND, wander=drift, zero=zero, frame_us=1999)
+    found = linearity.run(device)
     assert found.kept and np.abs(found.curve - BEND).max() < 0.005
     # In the dark an unlit code stops at 0: what is below is missing from our light.
-    assert np.abs(found.offset_codes - min(zero, 0.0)).max() < 0.6
+    assert found.zero == pytest.approx(min(zero, 0.0), abs=0.3) == device.zero_q2 / 4
+    assert np.abs(found.after).max() < 0.004 < np.abs(found.before).max()
+    again = linearity.run(device)
+    assert again.kept and again.zero == pytest.approx(found.zero, abs=0.3)
+
+
+def test_a_zero_that_was_found_in_the_dark_stays_in_the_light():
+    device = BentSensor(BEND, zero=-2.0, ambient=lambda t_us: 4.0, frame_us=1999)
+    device.curve(zero_codes=-2.0)
+    found = linearity.run(device)
+    assert found.zero == -2.0 and np.abs(found.curve - BEND).max() < 0.005
 
 
 def test_starts_from_the_curve_in_force_and_is_then_content():

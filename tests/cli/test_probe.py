@@ -145,6 +145,14 @@ def test_the_command_shows_the_matrix_and_names_what_is_wrong(command, command_j
     assert code == 1 and data["place"] == place
 
 
+def test_a_part_that_the_board_calls_dead_is_named_by_the_board(command_json, fake, faces):
+    seen = as_probed(board(faces[1], seed=1))
+    seen[:, 3] = np.nan
+    fake(see=plain(seen), fault=(0, 0, 0, lib.SG_FAULT_OPEN, 0, 0))
+    code, data, _ = command_json("probe", "PORT")
+    assert code == 1 and [row["text"][:16] for row in data["findings"]] == ["sensor 3 is open"]
+
+
 def test_probe_with_the_lights_off_or_with_photodiodes_says_why_not(command, fake):
     device = fake(alarm=lib.SG_ALARM_LIGHTS_OFF)
     code, _, err = command("probe", "PORT")

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings, self-calibration, probes and faults on a virtual Nano with the real headset's light."""
+
+import numpy as np
+import pytest
+
+from sparsegaze import probe
+from sparsegaze.device import Device
+
+pytestmark = pytest.mark.timeout(900)
+
+
+@pytest.fixture(scope="module")
+def nano(firmware_hex):
+    """An unpaced virtual Nano with the firmware and no model; simulated person 1."""
+    from sparsegaze.virtual import VirtualNano
+
+    with VirtualNano(person=1, unpaced=True, app=firmware_hex) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def kept(nano, tmp_path_factory):
+    """The matrix of the good board, in a file."""
+    with Device(nano.port) as device:
+        device.link.sleep(1.0)
+        matrix = probe.measure(device)
+    path = tmp_path_factory.mktemp("kept") / "probe.json"
+    probe.save(path, matrix)
+    return path
+
+
+def test_settings_are_in_force_at_once_and_survive_a_restart(command_json, nano):
+    code, data, _ = command_json("settings", nano.port)
+    assert code == 0 and data["rate_hz"] == pytest.approx(data["rate_limit_hz"], rel=0.01) > 900
+    assert data["limits_hz"]["gaze"] >= data["limits_hz"]["features"] >= data["limits_hz"]["counts"] >= 250
+    code, data, _ = command_json("settings", nano.port, "--rate", "250", "--repeats", "2")
+    assert code == 0 and data["rate_hz"] == pytest.approx(250, rel=0.01) and data["repeats"] == 2
+    code, data, _ = command_json("settings", nano.port)     # opening the port restarts the board
+    assert data["rate_hz"] == pytest.approx(250, rel=0.01) and data["repeats"] == 2
+    code, data, _ = command_json("stream", nano.port, "--seconds", "1")
+    assert data["rate_hz"] == pytest.approx(250, rel=0.01) and data["lost"] == 0
+    assert command_json("settings", nano.port, "--rate", "max", "--repeats", "1")[0] == 0
+
+
+def test_a_rate_that_the_board_cannot_reach_is_refused_by_its_limit(command, command_json, nano):
+    limit = command_json("settings", nano.port)[1]["limits_hz"]["gaze"]
+    code, out, err = command("settings", nano.port, "--rate", str(limit + 100))
+    assert code == 1 and f"at most {limit} Hz" in err
+    assert command_json("settings", nano.port)[1]["rate_hz"] == pytest.approx(limit, rel=0.01)
+
+
+def test_exposures_set_here_are_there_after_a_restart(command_json, nano):
+    code, data, _ = command_json("exposure", nano.port, "--set", "60,50,40,60,50,40")
+    assert code == 0 and not data["automatic"]
+    code, data, _ = command_json("exposure", nano.port)
+    assert data["exposure_us"] == pytest.approx([60, 50, 40, 60, 50, 40], rel=0.05) and not data["automatic"]
+    assert command_json("exposure", nano.port, "--auto")[1]["automatic"]
+
+
+def test_a_good_board_is_well_and_all_leds_are_in_their_places(command, nano, kept):
+    code, out, _ = command("status", nano.port)
+    assert code == 0 and "no fault" in out
+    assert command("doctor", nano.port)[0] == 0
+    for reference in (["--reference", kept], []):
+        code, out, _ = command("probe", nano.port, *reference)
+        assert code == 0 and "all six LEDs are where they belong" in out
+
+
+@pytest.mark.parametrize("one, other", [(1, 4), (0, 5), (2, 3), (0, 3)])
+def test_swapped_leds_are_named_by_either_reference(command, nano, kept, one, other):
+    nano.control.swap(one, other)
+    try:
+        for reference in (["--reference", kept], []):
+            code, out, _ = command("probe", nano.port, *reference)
+            assert code == 1 and f"LED {one} and LED {other} are in each other's places" in out
+    finally:
+        nano.control.swap(one, other)
+
+
+@pytest.mark.parametrize("kind, word", [("open", "sensor 3 is open"), ("short", "sensor 3 is shorted")])
+def test_a_broken_led_is_named_and_linearity_refuses_by_it(command, nano, kind, word):
+    nano.control.fault(3, kind)
+    try:
+        for name in ("status", "doctor", "probe"):
+            code, out, _ = command(name, nano.port)
+            assert code == 1 and word in out, name
+        code, _, err = command("linearity", nano.port)
+        assert code == 1 and word in err
+    finally:
+        nano.control.fault(3, "none")
+
+
+def test_a_supply_out_of_range_is_named_with_its_voltage(command, nano):
+    nano.control.supply(4.3)
+    try:
+        code, out, _ = command("status", nano.port)
+        assert code == 1 and "4.3" in out and "another USB port" in out
+    finally:
+        nano.control.supply(5.0)
+
+
+def test_lights_off_stay_off_over_a_restart_until_switched_on(command, nano):
+    assert command("settings", nano.port, "--lights", "off")[0] == 0
+    code, out, _ = command("status", nano.port)
+    assert code == 1 and "lights are off by command" in out
+    assert nano.control.lamps().lit == 0
+    assert command("settings", nano.port, "--lights", "on")[0] == 0
+
+
+@pytest.mark.parametrize("ambient_na", [0, 200], ids=["dark", "bright"])
+def test_linearity_takes_the_shift_away_in_front_of_a_living_eye(command_json, nano, ambient_na):
+    nano.control.ambient(ambient_na, 0.0, 50.0)
+    try:
+        code, data, _ = command_json("linearity", nano.port)
+        assert code == 0 and data["kept"]
+        before, after = (np.abs(data[f"shift_octaves_{when}"]) for when in ("before", "after"))
+        assert after.max() <= max(0.005, 0.5 * before.max())
+        with Device(nano.port) as device:
+            assert device.curve().curve == pytest.approx(data["curve"], abs=1e-6)
+            device.curve([0] * 6)
+            device.link.sleep(0.5)
+    finally:
+        nano.control.ambient(0, 0.0, 50.0)
+
+
+def test_linearity_in_a_light_that_moves_is_refused_and_nothing_stored(command, nano):
+    with Device(nano.port) as device:
+        before = device.curve()
+        now = nano.control.time()
+    for second in range(3, 14, 2):
+        nano.control.set_at(now.cycle + second * 16_000_000, "ambient_na", 300 if second % 4 == 3 else 0)
+    try:
+        code, out, err = command("linearity", nano.port)
+        assert code == 1 and "not steady" in err
+    finally:
+        nano.control.set_at_clear()
+        nano.control.ambient(0, 0.0, 50.0)
+    with Device(nano.port) as device:
+        assert device.curve() == before
