@@ -30,13 +30,10 @@ struct app_state {
     struct sg_link_rx link;
     struct sg_light light;
     struct sg_expose expose;
+    struct sg_health health;
+    struct sg_status status;            // its counters of the application
     uint16_t feature[HAL_CHANNELS];     // of the last frame
     uint16_t slot_bytes;
-    uint16_t tx_dropped;
-    uint16_t rx_rejected;
-    uint16_t saturated;
-    uint16_t starved;
-    uint16_t exposure_changes;
     uint8_t stream;                     // bits of enum sg_stream
     uint8_t slow_line;                  // 500 kbaud
     uint8_t probe;                      // the only emitter, or APP_NO_PROBE
@@ -118,7 +115,6 @@ const struct hal_timing *app_timing(void);                  // in force
 void app_sense_cycle(const struct hal_cycle *cycle);        // exposure and health of one channel, or two
 uint8_t app_alarm(void);                                    // bits of enum sg_alarm
 uint8_t app_fault(void);                                    // 1: the gaze is not to be trusted
-void app_faults(uint8_t fault[HAL_CHANNELS]);
 void app_expose_by(uint8_t op, const uint16_t exposure_us_q4[HAL_CHANNELS]);    // enum sg_exposure_op
 int8_t app_probe(uint8_t emitter, uint16_t seq);            // SG_OK: begun, answers by itself when done
 uint8_t app_probing(void);                                  // 1: the cycle just added belongs to a probe

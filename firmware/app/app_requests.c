@@ -13,7 +13,7 @@ union app_body app_body;
 SELDOM static void refuse(uint8_t type, uint16_t seq, int8_t error)
 {
     const struct sg_error why = { .error = error, .type = type };
-    app_count(&app.rx_rejected);
+    app_count(&app.status.rx_rejected);
     app_send(SG_MSG_ERROR, seq, &why, sizeof why, 0);
 }
 
@@ -55,23 +55,19 @@ SELDOM static int8_t shortest(uint8_t type)
 
 SELDOM static void status(struct sg_status *out)
 {
-    memset(out, 0, sizeof *out);
+    *out = app.status;
     hal_report(out);
     out->t_us = hal_now_us();
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
         out->exposure_us_q4[i] = app.expose.led[i].exposure_cycles;
+        out->fault[i] = app.health.fault[i];
+    }
     out->boot_count = app_live.boots;
-    out->tx_dropped = app.tx_dropped;
     const uint16_t bad = app.link.bad_crc + app.link.bad_length;
     out->rx_bad = bad < app.link.bad_crc ? UINT16_MAX : bad;
-    out->rx_rejected = app.rx_rejected;
-    out->saturated = app.saturated;
-    out->starved = app.starved;
-    out->exposure_changes = app.exposure_changes;
     out->stream = app.stream;
     out->exposure_auto = app_live.exposure_auto;
     out->active = app_model_slot();
-    app_faults(out->fault);
     out->alarm |= app_alarm();
 }
 
@@ -95,7 +91,7 @@ SELDOM static int8_t curve(struct sg_curve *io)
         memcpy(app_live.curve_q10, io->curve_q10, sizeof app_live.curve_q10);
         app_live.zero_q2 = io->zero_q2;
         app_live_changed();
-        sg_light_curve(&app.light, app_live.curve_q10);
+        sg_light_curve(&app.light, app_live.curve_q10, app_live.zero_q2);
     }
     memcpy(io->curve_q10, app_live.curve_q10, sizeof io->curve_q10);
     io->zero_q2 = app_live.zero_q2;

@@ -20,7 +20,6 @@ static const uint8_t before[2][HAL_CHANNELS] SG_ROM = {
     { 255, 255, 255, 0, 1, 2 },
 };
 
-static struct sg_health health;
 static struct hal_timing timing;        // in force
 static uint16_t wanted_mark;            // CRC of what was asked for: the port may have taken something close to it
 static uint8_t faulty;                  // a channel is
@@ -36,11 +35,6 @@ uint8_t app_alarm(void)
 uint8_t app_fault(void)
 {
     return faulty || app_alarm();
-}
-
-void app_faults(uint8_t fault[HAL_CHANNELS])
-{
-    memcpy(fault, health.fault, HAL_CHANNELS);
 }
 
 // Ask the port for the exposures wanted, and for the rest take what it made of them.
@@ -77,7 +71,7 @@ SELDOM static void expose_again(void)
 SELDOM static void light_again(void)
 {
     sg_light_start(&app.light, timing.wiring, timing.period_cycles);
-    sg_light_curve(&app.light, app_live.curve_q10);
+    sg_light_curve(&app.light, app_live.curve_q10, app_live.zero_q2);
 }
 
 static uint16_t mark_of(const struct hal_timing *t)
@@ -94,7 +88,7 @@ SELDOM void app_sense_start(const struct hal_timing *begin)
     hal_start(&timing, cycles);
     light_again();
     expose_at(app_live.exposure_cycles);
-    sg_health_start(&health);
+    sg_health_start(&app.health);
 }
 
 SELDOM void app_sense_timing(const struct hal_timing *wanted)
@@ -140,7 +134,7 @@ SELDOM void app_expose_by(uint8_t op, const uint16_t exposure_us_q4[HAL_CHANNELS
 SELDOM static void exposures_moved(void)
 {
     expose();
-    app_count(&app.exposure_changes);
+    app_count(&app.status.exposure_changes);
 }
 
 static uint8_t first(uint8_t i)
@@ -160,7 +154,7 @@ static void look_at(const struct sg_reading *reading)
     sight.most_cycles = hal_exposure_most(i);
     sight.feature = app.feature[i];
     sg_track_range(app_model(), i, &sight);
-    faulty = sg_health_look(&health, i, &sight);
+    faulty = sg_health_look(&app.health, i, &sight);
     look = i == HAL_CHANNELS - 1 ? 0 : i + 1;
 }
 

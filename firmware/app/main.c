@@ -24,10 +24,9 @@ static struct {
 
 // The frame under way.
 static uint32_t first_us;               // mean sample time of its first cycle
-static uint32_t later_us;               // sum of what the others' is later
-static uint8_t taken;                   // cycles
-static uint8_t left;                    // of the last one taken
 static uint16_t frame_seq;
+static uint8_t left;                    // cycles still to come
+static uint8_t under_way;
 
 static uint16_t previous_exposure[HAL_CHANNELS];
 static uint32_t out_us;                 // when the last frame out of range was sensed
@@ -48,7 +47,7 @@ uint8_t app_send(uint8_t type, uint16_t seq, const void *body, uint8_t n, uint8_
 static void send_stream(uint8_t type, const void *body, uint8_t n)
 {
     if (!app_send(type, frame_seq, body, n, REPLY_RESERVE))
-        app_count(&app.tx_dropped);
+        app_count(&app.status.tx_dropped);
 }
 
 SELDOM void app_infer_later(const struct sg_infer *point, uint16_t seq)
@@ -125,15 +124,19 @@ SELDOM static void count_readings(void)
 {
     for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
         if (app.light.channel[i].flags & SG_LIGHT_SATURATED)
-            app_count(&app.saturated);
+            app_count(&app.status.saturated);
         if (app.light.channel[i].flags & SG_LIGHT_STARVED)
-            app_count(&app.starved);
+            app_count(&app.status.starved);
     }
 }
 
 // The frame whose last cycle this is: features -> gaze -> streams, the gaze first, somebody waits for it.
-static void finish_frame(const struct hal_cycle *cycle, uint32_t t_us)
+static void finish_frame(const struct hal_cycle *cycle)
 {
+    // Cycles follow each other evenly: their mean is the mean of the first and the last.
+    const uint16_t half_us = (uint16_t)(cycle->t_us - first_us) >> 1;
+    const uint32_t t_us = first_us + half_us;
+    const uint16_t span_us = (uint16_t)(cycle->t_us - t_us) + cycle->span_us;
     const struct sg_model_view *model = app_model();
     const struct sg_affine *recentre = app_recentre();
     struct app_streams *out = &app_body.streams;
@@ -164,12 +167,12 @@ static void finish_frame(const struct hal_cycle *cycle, uint32_t t_us)
     HAL_BEGIN(HAL_SECTION_OUTPUT);
     if (app.stream & SG_STREAM_GAZE) {
         out->gaze.t_us = t_us;
-        out->gaze.infer_us = (uint16_t)(hal_now_us() - cycle->t_us) - cycle->span_us;
+        out->gaze.infer_us = (uint16_t)hal_now_us() - (uint16_t)t_us - span_us;
         send_stream(SG_MSG_GAZE, &out->gaze, sizeof out->gaze);
     }
     if (app.stream & SG_STREAM_RAW) {
         out->raw.t_us = t_us;
-        out->raw.span_us = (uint16_t)(cycle->t_us - t_us) + cycle->span_us;
+        out->raw.span_us = span_us;
         out->raw.flags = flags;
         send_raw(&out->raw, model, recentre);
     }
@@ -178,34 +181,20 @@ static void finish_frame(const struct hal_cycle *cycle, uint32_t t_us)
     HAL_END(HAL_SECTION_OUTPUT);
 }
 
-static uint32_t mean_time(const struct hal_cycle *cycle)
-{
-    if (taken == 1)
-        return cycle->t_us;
-    // A frame whose every cycle came has a power of two of them; one with a gap is late anyway.
-    uint8_t shift = 0;
-    while (taken >> 1 >> shift)
-        shift++;
-    return first_us + (later_us >> shift);
-}
-
 // Take up a cycle: is it the next of the frame under way?
 static void take(const struct hal_cycle *cycle)
 {
-    if (taken == 0 || cycle->seq != frame_seq || cycle->left != left - 1) {
-        if (cycle->left != app_live.repeats - 1 || cycle->seq != (uint16_t)(frame_seq + 1U) || app.pause)
+    if (!under_way || cycle->seq != frame_seq || cycle->left != left - 1) {
+        frame_seq++;
+        if (cycle->left != app_live.repeats - 1 || cycle->seq != frame_seq || app.pause)
             sg_light_gap(&app.light);
-        if (taken)                      // cycles of a frame that lost its last one
+        if (under_way)                  // cycles of a frame that lost its last one
             sg_light_features(&app.light, app.feature);
         frame_seq = cycle->seq;
-        taken = 0;
-        later_us = 0;
         first_us = cycle->t_us;
     }
-    taken++;
     left = cycle->left;
-    if (taken != 1)
-        later_us += cycle->t_us - first_us;
+    under_way = left != 0;
     sg_light_add(&app.light, &cycle->reading);
 }
 
@@ -216,19 +205,17 @@ void app_on_cycle(const struct hal_cycle *cycle)
         app_rate_renew();
     }
     take(cycle);
-    const uint8_t last = cycle->left == 0;
+    const uint8_t last = !under_way;
     if (app_probing()) {
         if (last && app.stream)
-            app_count(&app.tx_dropped);
+            app_count(&app.status.tx_dropped);
     } else {
         if (last && !long_work())
-            finish_frame(cycle, mean_time(cycle));
+            finish_frame(cycle);
         else if (last && app.stream)
-            app_count(&app.tx_dropped);
+            app_count(&app.status.tx_dropped);
         app_sense_cycle(cycle);
     }
-    if (last)
-        taken = 0;
     app_live_cycle(cycle->t_us);
     app.fresh = 1;
 }
