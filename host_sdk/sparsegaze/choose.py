@@ -12,10 +12,10 @@ from .trustfit import CELLS_MAX
 # them, the same for every input: those of a model without vectors, and of a vector.
 # tests/unit/test_fit_choice.py holds them against tests/budget.csv.
 CYCLES_BASE, CYCLES_EACH = 2770, 149.5
-NANO_SLOT_BYTES = 2048  # of one of the Nano's two model slots, as its firmware says in HELLO
-CELLS_LEAST = 6  # per axis, of the grid of what to expect: cells of some 7 degrees
+NANO_SLOT_BYTES = 1536  # of one of the Nano's two model slots, as its firmware says in HELLO
+CELLS_LEAST = 5  # per axis, of the grid of what to expect: cells of some 9 degrees
 ROOM = (NANO_SLOT_BYTES - HEAD_BYTES - NODE_BYTES * (CELLS_LEAST + 1) ** 2) // RECORD_BYTES
-MOST = 78  # vectors chosen without being asked for: past this nothing is gained, and the grid gets coarser
+MOST = 64  # vectors chosen without being asked for: past this nothing is gained, and the grid gets coarser
 AIM_DEG = 0.05  # rms distance to the full process
 LOSS = 1.05  # and the truth error may be this much the full process's
 FINE_DEG = 0.01  # rms distance below which more vectors change nothing: the output has steps of 1/128 deg

@@ -11,7 +11,7 @@ import click
 from .cli_device import json_option, port_argument
 from .console import Console, pairs, table
 
-VECTORS = click.IntRange(1, 128)  # choose.ROOM
+VECTORS = click.IntRange(1, 91)  # choose.ROOM
 VECTORS_HELP = "Calibration vectors of the device's model.  [default: the fewest that do]"
 KERNELS = ("rbf", "matern52", "laplace", "minkowski", "canberra", "cosine")
 

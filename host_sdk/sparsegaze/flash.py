@@ -9,7 +9,7 @@ from .errors import DisconnectedError, FlashError
 from .stk500 import BOOTLOADERS, PAGE_BYTES, Bootloader, verify_pages, write_pages
 from .transport import open_link
 
-APPLICATION_BYTES = 0x6800      # above it: the two model slots, then the bootloaders
+APPLICATION_BYTES = 0x6C00      # above it: the two model slots, then the bootloaders
 PARKED = b"\xff\xcf" * (PAGE_BYTES // 2)    # rjmp to itself, all over the first page
 FIRMWARE_HEX = Path(__file__).parent / "data" / "firmware.hex"
 

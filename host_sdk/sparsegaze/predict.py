@@ -31,7 +31,7 @@ from .wire import ffi, lib
 DEG_Q7 = 128.0
 # Where the application expects its two model slots in the flash of an ATmega328P; checked against HELLO.
 NANO_FLASH_BYTES = 32768
-NANO_SLOT_BASE = (0x6800, 0x7000)
+NANO_SLOT_BASE = (0x6C00, 0x7200)
 REQUEST_SECTION = 6             # HAL_SECTION_REQUEST of hal_port.h
 BATCH_ROWS = 256
 QEMU_WINDOW = 32                # its line never loses a byte
