@@ -34,6 +34,8 @@ def run(seed, cuts, bumpy_map, jitter=0.0, **keys):
                 time.sleep(jitter * draws.random())
                 board.command("state")          # looking does not disturb
                 board.command("node 0")
+                board.command("lamps")
+                board.command("counters clear")
         end = board.command("state")
     return data, end
 

@@ -258,7 +258,6 @@ static void do_swap(struct call *c)
 static void do_lamps(struct call *c)
 {
     const struct lamps *l = &c->nano->leds.lamps;
-    leds_settle(&c->nano->leds, c->nano->avr->cycle);
     say(c, "ok %d %.9g %.9g %.9g", l->on.lit, l->total_amperes, lamps_supply_at(l, c->nano->avr->cycle),
         l->rail_volts);
 }
@@ -287,7 +286,6 @@ static void do_counters(struct call *c)
         say(c, "err counters takes nothing or clear");
         return;
     }
-    leds_settle(&n->leds, n->avr->cycle);
     lamps_count(l, n->avr->cycle);
     const struct bridge *b = &c->session->bridge;
     say(c, "ok uart_overruns=%" PRIu64 " rx_garbage=%" PRIu64 " tx_garbage=%" PRIu64 " rx_bytes=%" PRIu64

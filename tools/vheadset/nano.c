@@ -171,7 +171,6 @@ static void before_cycle(void *param, uint64_t cycle)
 
 void nano_clear_counters(struct nano *nano)
 {
-    leds_settle(&nano->leds, nano->avr->cycle);
     lamps_clear(&nano->leds.lamps, nano->avr->cycle);
     nano->asleep_cycles = 0;
 }
