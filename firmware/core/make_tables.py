@@ -28,6 +28,10 @@ FLICKER_HZ = 110.0
 LIT_BEFORE_UNLIT = 3.0 / 18.0
 PERIOD_FROM, PERIOD_STEP, PERIOD_NODES = 15984, 2048, 9
 
+# Of one code, rms, at an ADC clock of 250 kHz. Means of less than 40/32 are raised by codes that cannot be negative.
+NOISE_LSB = 0.755
+CLIPPED_NODES, CLIPPED_OFFSET = 40, 128
+
 LICENSE = "// SPDX-License-Identifier: Apache-2.0\n"
 MADE_BY = "// Made by make_tables.py; edit that.\n"
 
@@ -144,11 +148,30 @@ def light_table():
             f"#define EARLIER_MINUS_Q8 {{ {', '.join(str(rounded(-256 * c)) for _, c in weights)} }}\n\n#endif\n")
 
 
+def rectified(level, noise):
+    """Mean code of a level, in codes, under noise (rms) when nothing below 0 is read: sum over the codes' thresholds."""
+    return sum(0.5 * math.erfc((code - 0.5 - level) / noise / math.sqrt(2)) for code in range(1, 12))
+
+
+def unclipped():
+    """[level, 1/32 code] below a mean code of i / 32, i = 0..39, of the converter's noise; a mean of 0 is 0.1 / 32."""
+    levels = []
+    for i in range(CLIPPED_NODES):
+        low, high = -4.0, 4.0
+        for _ in range(50):
+            middle = (low + high) / 2
+            low, high = (middle, high) if rectified(middle, NOISE_LSB) < max(i, 0.1) / CODE_UNIT else (low, middle)
+        levels.append(rounded(low * CODE_UNIT))
+    return levels
+
+
 def log2_table():
     """Text of sg_light_table.c. The last entry is one less, so that no logarithm reaches the next octave."""
     mantissa = [rounded(FEATURE_PER_OCTAVE * math.log2(1 + i / 64)) for i in range(64)] + [FEATURE_PER_OCTAVE - 1]
     return (LICENSE + MADE_BY + '#include "sg_light_loop.h"\n#include "sg_rom.h"\n\n'
-            "const uint16_t sg_light_log2_table[65] SG_ROM = {\n" + rows(mantissa) + "};\n")
+            "const uint16_t sg_light_log2_table[65] SG_ROM = {\n" + rows(mantissa) + "};\n\n"
+            "const uint8_t sg_light_clipped_table[SG_LIGHT_CLIPPED_Q5] SG_ROM = {\n"
+            + rows([CLIPPED_OFFSET + level for level in unclipped()], 20) + "};\n")
 
 
 def crc32_table():

@@ -22,8 +22,9 @@ void sg_light_start(struct sg_light *light, uint8_t wiring, uint16_t period_cycl
         light->channel[i].slope_q16 = SG_LIGHT_SLOPE_Q16;
 }
 
-void sg_light_curve(struct sg_light *light, const int8_t curve_q10[6])
+void sg_light_curve(struct sg_light *light, const int8_t curve_q10[6], int8_t zero_q2)
 {
+    light->zero_q5 = zero_q2 > 0 ? 0 : zero_q2 < -16 ? -128 : (int8_t)(zero_q2 * 8);
     for (uint8_t i = 0; i < SG_LIGHT_CHANNELS; i++)
         light->channel[i].slope_q16 = (int16_t)(SG_LIGHT_SLOPE_Q16 + 128 * curve_q10[i]);
 }

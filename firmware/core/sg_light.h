@@ -62,6 +62,8 @@ struct sg_light {
     uint16_t moving;                // mean square of the sum of the unlit codes' departures, 1/64 code^2
     uint8_t wiring;                 // enum sg_wiring
     uint8_t fresh;                  // earlier unlit codes are none: 1 after a gap, 2 as ambient light begins to move
+    int8_t zero_q5;                 // the least that a mean unlit code can mean, 0 or less
+    uint8_t dither;                 // 0..15: a mean must not stop short of what it follows
 };
 
 // Begin, or begin anew after a change of timing or wiring: nothing is known, curves are 0.
@@ -69,9 +71,11 @@ struct sg_light {
 //   period_cycles  of a sensing cycle; taken as 15984..31986
 void sg_light_start(struct sg_light *light, uint8_t wiring, uint16_t period_cycles);
 
-// Curvature by self-calibration, 1/1024, on top of the nominal junction's: charge = code * (1 + ... + curve * code
-// / 1024). In force from the next cycle on.
-void sg_light_curve(struct sg_light *light, const int8_t curve_q10[6]);
+// By self-calibration. In force from the next cycle on.
+//   curve_q10  curvature, 1/1024, on top of the nominal junction's: charge = code * (1 + ... + curve * code / 1024)
+//   zero_q2    code that the converter would read at 0 V if codes could be negative, 1/4 code, -128..0: how far down
+//              the mean of unlit codes that are clipped at 0 may be thought to be
+void sg_light_curve(struct sg_light *light, const int8_t curve_q10[6], int8_t zero_q2);
 
 // A gap in the cycles (a pause between frames, a lost cycle): unlit codes of before are no longer neighbours in
 // time. What rests is kept; what moves begins anew.

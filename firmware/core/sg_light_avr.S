@@ -24,6 +24,8 @@
 #define LIGHT_MOVING 2
 #define LIGHT_WIRING 4
 #define LIGHT_FRESH 5
+#define LIGHT_ZERO 6
+#define LIGHT_DITHER 7
 #define READING_HELD 48
 #define READING_LIT 0
 #define READING_UNLIT 12
@@ -41,6 +43,8 @@
 #define DEPARTURE_MOST 63
 #define FRESH_MOVING 2
 #define FULL_HIGH 0x7D          /* of 1000 codes, 1/32 */
+#define STEP 112
+#define CLIPPED 40
 #define CALM_HIGH 0x60          /* below, an interpolated code fits 15 bits */
 #define LEAP_HIGH 4
 #define LEAST_LOW 128           /* of what is not starved */
@@ -59,6 +63,8 @@
 #define departh r13
 #define broughtl r14
 #define broughth r15
+#define dither r10              /* as it rests, in the place of the weights */
+#define floor_q5 r11
 #define moving r16              /* 0: light rests, 1: it moves, 2: in between */
 #define turn r17
 
@@ -142,7 +148,11 @@ sg_light_add:
     rjmp 3f
 2:  clr r24
     clr r25
-3:  push r25                    ; moving_q8
+3:  cpse moving, zero
+    rjmp 4f
+    ldd dither, Y + LIGHT_DITHER
+    ldd floor_q5, Y + LIGHT_ZERO
+4:  push r25                    ; moving_q8
     push r24
     clr departl
     clr departh
@@ -223,19 +233,21 @@ each:
     tst moving
     brne moves
 
-    ; light that rests: within 4 codes of the mean
+    ; light that rests: within 3.5 codes of the mean
     mov r27, r24
     lsl r27
     sbc r27, r27
     cp r27, r25
     brne 2f
-    cpi r24, 0x80
-    brne 3f
+    mov r25, r24
+    subi r25, 1 - STEP
+    cpi r25, 2 * STEP - 1
+    brlo 3f
 2:  rjmp other
-3:  asr r24                     ; (departure + 8) / 16 in a byte
+3:  add r24, dither             ; a sixteenth of it in a byte
     asr r24
     asr r24
-    inc r24
+    asr r24
     asr r24
     mov r25, r24
     lsl r25
@@ -246,6 +258,22 @@ each:
     adc r23, r25
     std Y + CHANNEL_MEAN, r22
     std Y + CHANNEL_MEAN + 1, r23
+    cpi r22, CLIPPED
+    cpc r23, zero
+    brsh meant_near
+    ldi r30, lo8(sg_light_clipped_table)
+    ldi r31, hi8(sg_light_clipped_table)
+    add r30, r22
+    adc r31, zero
+    lpm r22, Z
+    subi r22, 128
+    cp r22, floor_q5
+    brge 4f
+    mov r22, floor_q5
+4:  mov r23, r22
+    lsl r23
+    sbc r23, r23
+meant_near:
     rjmp meant
 
 moves:
@@ -428,6 +456,10 @@ next:
     ldi r25, hi8(MOVING_MOST)
 6:  std Y + LIGHT_MOVING, r24
     std Y + LIGHT_MOVING + 1, r25
+    ldd r20, Y + LIGHT_DITHER
+    subi r20, -7
+    andi r20, 15
+    std Y + LIGHT_DITHER, r20
     ldi r20, lo8(MOVING_FROM)
     ldi r21, hi8(MOVING_FROM)
     cp r20, r24                 ; above now, and not above before?

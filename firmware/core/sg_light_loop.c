@@ -84,12 +84,19 @@ static int16_t missed_q5(struct sg_light_channel *channel, uint16_t code, uint16
     return came <= 0 ? 0 : (int16_t)(((uint32_t)came * ratio) >> 16);
 }
 
+// What the mean would be if codes could be negative, down to the code of 0 V.
+static int16_t unclipped_q5(uint16_t mean_q5, int8_t zero_q5)
+{
+    const int8_t level = (int8_t)(sg_rom_byte(&sg_light_clipped_table[mean_q5], SG_ROM_FLASH) - 128);
+    return level < zero_q5 ? zero_q5 : level;
+}
+
 // One unlit code into what is known of the ambient light. Returns the unlit code meant at the lit moment.
-static uint16_t ambient_q5(const struct sg_light *light, struct sg_light_channel *channel, uint16_t unlit_q5,
-                           struct sg_light_pass *pass)
+static int16_t ambient_q5(const struct sg_light *light, struct sg_light_channel *channel, uint16_t unlit_q5,
+                          struct sg_light_pass *pass)
 {
     const int16_t off = (int16_t)(unlit_q5 - channel->mean_q5);
-    int16_t step = (int16_t)((off + 8) >> 4);
+    int16_t step = (int16_t)((off + (pass->moving_q8 == 0 ? light->dither : 8)) >> 4);
     pass->departure = (int16_t)(pass->departure + step);
     if (channel->settled < SG_LIGHT_SETTLED) {
         uint8_t shift = 0;
@@ -102,11 +109,11 @@ static uint16_t ambient_q5(const struct sg_light *light, struct sg_light_channel
     channel->mean_q5 = mean;
     if (pass->moving_q8 == 0) {
         if (size_of(off) < SG_LIGHT_STEP_Q5)
-            return mean;
+            return mean < SG_LIGHT_CLIPPED_Q5 ? unclipped_q5(mean, light->zero_q5) : (int16_t)mean;
         settle(channel, unlit_q5);
         if (size_of(off) >= SG_LIGHT_LEAP_Q5)
             channel->flags |= SG_LIGHT_STARVED;
-        return unlit_q5;
+        return (int16_t)unlit_q5;
     }
     const uint16_t before = channel->unlit_q5[0], earlier = channel->unlit_q5[1];
     channel->unlit_q5[1] = before;
@@ -117,13 +124,13 @@ static uint16_t ambient_q5(const struct sg_light *light, struct sg_light_channel
         if (size_of(past) - SG_LIGHT_LEAP_Q5 >= most - (most >> 4)) {
             settle(channel, unlit_q5);
             channel->flags |= SG_LIGHT_STARVED;
-            return unlit_q5;
+            return (int16_t)unlit_q5;
         }
     }
     int32_t meant = (int32_t)unlit_q5 + by_q8(past, light->before_q8) - by_q8(long_past, light->earlier_q8);
     if (pass->moving_q8 < SG_LIGHT_MOVING_FULL)
         meant = mean + (((meant - mean) * pass->moving_q8) >> 8);
-    return meant < 0 ? 0 : meant > INT16_MAX ? INT16_MAX : (uint16_t)meant;
+    return meant < 0 ? 0 : meant > INT16_MAX ? INT16_MAX : (int16_t)meant;
 }
 
 // A channel's first cycle, or its first with another exposure: what it has of this frame is dropped.
@@ -158,9 +165,9 @@ void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint
         // From charge to code: over the curve's slope, 1 + 2 k1 x, of which `more` has the half.
         unlit_q5 = (uint16_t)(unlit_q5 + more - high(more, high((int16_t)unlit_q5, TWICE_K1_Q16)));
     }
-    const uint16_t meant_q5 = ambient_q5(light, channel, unlit_q5, pass);
+    const int16_t meant_q5 = ambient_q5(light, channel, unlit_q5, pass);
     const int16_t difference = (int16_t)(lit_q5 - meant_q5);
-    const int16_t bend = bend_q5(lit_q5, meant_q5, channel->slope_q16);
+    const int16_t bend = bend_q5(lit_q5, (uint16_t)meant_q5, channel->slope_q16);
     const int16_t brought = high(pass->brought_q5, SHARE_Q16);
     if (channel->cycles != UINT8_MAX) {
         const int32_t signal = (int32_t)difference + (int16_t)(bend + missed - brought);
@@ -242,6 +249,7 @@ void sg_light_add(struct sg_light *light, const struct sg_reading *reading)
     if (moving > SG_LIGHT_MOVING_FROM && light->moving <= SG_LIGHT_MOVING_FROM)
         light->fresh |= SG_LIGHT_FRESH_MOVING;
     light->moving = moving;
+    light->dither = (light->dither + 7U) & 15U;
 }
 
 uint8_t sg_light_features(struct sg_light *light, uint16_t feature[6])

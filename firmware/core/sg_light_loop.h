@@ -11,7 +11,7 @@
 
 enum {
     SG_LIGHT_SETTLED = 16,              // the mean of unlit codes follows by 1/16 from then on
-    SG_LIGHT_STEP_Q5 = 4 * 32,          // five times the noise: what rested has moved
+    SG_LIGHT_STEP_Q5 = 112,             // 3.5 codes, 4.3 times the noise: what rested has moved
     SG_LIGHT_LEAP_Q5 = 32 * 32,         // of which nobody knows whether the lit exposure saw it
     // Mean square of what six channels depart together: noise alone is 256.
     SG_LIGHT_MOVING_FROM = 768,
@@ -21,6 +21,7 @@ enum {
     SG_LIGHT_FRESH_GAP = 1,
     SG_LIGHT_FRESH_MOVING = 2,
     SG_LIGHT_UNIT = 32,
+    SG_LIGHT_CLIPPED_Q5 = 40,
 };
 
 // What passes from channel to channel within a cycle.
@@ -40,13 +41,18 @@ _Static_assert(sizeof(struct sg_light_channel) == 20 && offsetof(struct sg_light
                && offsetof(struct sg_light_channel, flags) == 18, "channel layout");
 _Static_assert(offsetof(struct sg_light, before_q8) == 120 && offsetof(struct sg_light, earlier_q8) == 121
                && offsetof(struct sg_light, moving) == 122 && offsetof(struct sg_light, wiring) == 124
-               && offsetof(struct sg_light, fresh) == 125, "layout");
+               && offsetof(struct sg_light, fresh) == 125
+               && offsetof(struct sg_light, zero_q5) == 126 && offsetof(struct sg_light, dither) == 127, "layout");
 _Static_assert(offsetof(struct sg_reading, held_code) == 48 && offsetof(struct sg_reading, unlit_code) == 12 && offsetof(struct sg_reading, exposure_cycles) == 24
                && offsetof(struct sg_reading, late_lit_cycles) == 36
                && offsetof(struct sg_reading, late_unlit_cycles) == 42, "reading layout");
 
 // 4096 * log2(1 + i / 64), in program memory.
 extern const uint16_t sg_light_log2_table[65];
+
+// Level behind a mean unlit code below SG_LIGHT_CLIPPED_Q5, both 1/32 code, the level plus 128: a code is never
+// negative, so noise raises a mean near 0.
+extern const uint8_t sg_light_clipped_table[SG_LIGHT_CLIPPED_Q5];
 
 // 4096 * log2(x), x in 1..65535: rounded, at most 1.5 off.
 uint16_t sg_light_log2_q12(uint16_t x);

@@ -130,11 +130,10 @@ class Board:
 class Light:
     """struct sg_light of the core."""
 
-    def __init__(self, board=None, wiring=lib.SG_WIRING_LEDS, period=15984, curve=None):
+    def __init__(self, board=None, wiring=lib.SG_WIRING_LEDS, period=15984, curve=None, zero_q2=0):
         self.state = ffi.new("struct sg_light *")
         lib.sg_light_start(self.state, board.wiring if board else wiring, board.period if board else period)
-        if curve is not None:
-            lib.sg_light_curve(self.state, curve)
+        lib.sg_light_curve(self.state, curve or [0] * 6, zero_q2)
         self.feature = ffi.new("uint16_t[6]")
 
     def frame(self, *readings):

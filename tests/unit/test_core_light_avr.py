@@ -9,13 +9,13 @@ from sparsegaze._core import ffi, lib
 
 TWINS = {"assembly": (), "portable": ("SG_LIGHT_PORTABLE",)}
 CHANNEL_BYTES = 20
-STATE_BYTES = 6 * CHANNEL_BYTES + 6
+STATE_BYTES = 6 * CHANNEL_BYTES + 8
 BODY = ("out[12] = 0; sg_light_add(&light, (const struct sg_reading *)in);"
         "if (in[50] & 1) sg_light_gap(&light);"
         "if (in[50] & 2) out[12] = sg_light_features(&light, (uint16_t *)out);"
         "memcpy(out + 13, &light, sizeof light);")
 SETUP = ("static struct sg_light light; static const int8_t curve[6] = { 0, 20, -20, 127, -128, 5 };"
-         "sg_light_start(&light, %d, 20000); sg_light_curve(&light, curve);")
+         "sg_light_start(&light, %d, 20000); sg_light_curve(&light, curve, -%d);")
 CURVE = [0, 20, -20, 127, -128, 5]
 
 
@@ -61,11 +61,11 @@ def readings(rng, n, hard):
     return np.frombuffer(b"".join(rows), np.uint8).reshape(n, 52)
 
 
-def on_host(rows, wiring):
+def on_host(rows, wiring, zero_q2):
     """What the firmware should write for the same rows."""
     light, feature, out = ffi.new("struct sg_light *"), ffi.new("uint16_t[6]"), []
     lib.sg_light_start(light, wiring, 20000)
-    lib.sg_light_curve(light, CURVE)
+    lib.sg_light_curve(light, CURVE, -zero_q2)
     for row in rows:
         reading = ffi.new("struct sg_reading *")
         ffi.memmove(reading, row.tobytes(), 50)
@@ -85,9 +85,10 @@ def on_host(rows, wiring):
 @pytest.mark.parametrize("wiring", [lib.SG_WIRING_LEDS, lib.SG_WIRING_PHOTODIODES])
 @pytest.mark.parametrize("hard", [0.0, 0.1, 0.7])
 def test_both_twins_are_bit_identical_to_the_host(twin, wiring, hard, tmp_path):
+    zero_q2 = int(10 * hard)
     rows = readings(np.random.default_rng(int(10 * hard) + wiring), 330, hard)
     result = core_avr_cases.run_cases(tmp_path, BODY, rows, 13 + STATE_BYTES, includes=["sg_light.h"],
-                                      setup=SETUP % wiring, defines=TWINS[twin])
-    expected = on_host(rows, wiring)
+                                      setup=SETUP % (wiring, zero_q2), defines=TWINS[twin])
+    expected = on_host(rows, wiring, zero_q2)
     wrong = np.flatnonzero((result.output != expected).any(axis=1))
     assert wrong.size == 0, (wrong[:5], np.flatnonzero(result.output[wrong[0]] != expected[wrong[0]]))
