@@ -7,7 +7,7 @@ from . import wire
 from .errors import DeviceError, NoDeviceError
 from .wire import lib
 
-TRY_TIMEOUTS_S = (0.5, 1.0, 2.0)
+TRY_TIMEOUTS_S = (0.5, 1.0003, 2.0)  # the second try must not meet the same moment of a frame again
 BUSY_WAIT_S = 0.02
 WINDOW = 2                      # requests under way at a time: a longer burst overruns the receiver
 MANY_TRIES = 5                  # of one of many requests: at full rate some meet a busy receiver
