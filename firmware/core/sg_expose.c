@@ -9,10 +9,10 @@ enum {
     FREED_Q2 = 58,              // a quarter of the range: worth a longer exposure
     WORTH_Q2 = 160,             // a load below it is
     FALL_CYCLES = 3,            // the dark of a lamp that flickers to nothing at 100 Hz is shorter
-    FALL_LEAST = 6 * 32,
+    FALL_LEAST_Q2 = 8,          // of a peak, below which a fall says nothing
     CAUTION_MOST = 6,
     ACQUIRED_A_CYCLE = 2,
-    SLOW_LOOKS = 170,           // 1 s at 6 ms a round
+    SLOW_ROUNDS = 170,          // 1 s at 6 ms a round
 };
 
 static uint16_t clipped(uint16_t cycles, uint16_t most)
@@ -29,7 +29,7 @@ uint16_t sg_expose_from_us_q4(uint16_t exposure_us_q4)
 
 void sg_expose_start(struct sg_expose *expose, const uint16_t exposure_cycles[6], const uint16_t most_cycles[6])
 {
-    *expose = (struct sg_expose) { .next = 0 };
+    *expose = (struct sg_expose) { .acquiring = 1 };
     for (uint8_t i = 0; i < CHANNELS; i++) {
         struct sg_expose_led *led = &expose->led[i];
         led->most_cycles = clipped(most_cycles[i], SG_EXPOSE_MAX_CYCLES);
@@ -138,59 +138,77 @@ static uint8_t look(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
     return change(led, wanted(led, (uint16_t)(led->unlit_peak << 2), (uint16_t)(signal_q2 << 2)), SG_EXPOSE_VERIFY);
 }
 
-// Has the light around fallen away? Then all exposures are too short, and wait for no patience.
-static void watch_ambient(struct sg_expose *expose, uint16_t sum)
+// Has the light around fallen away? Looks in consecutive cycles, each at another sensor, say so. Then all exposures
+// are too short, and wait for no patience.
+static void watch_ambient(struct sg_expose *expose, const struct sg_expose_led *led, uint16_t unlit)
 {
-    if (sum >= expose->ambient_peak >> 4) {
+    if (led->unlit_peak < FALL_LEAST_Q2 || unlit >> 2 >= led->unlit_peak >> 4) {
         expose->fallen = 0;
-        expose->ambient_peak = sum > expose->ambient_peak ? sum
-                             : (uint16_t)(expose->ambient_peak - (expose->ambient_peak >> 6));
         return;
     }
-    if (expose->ambient_peak < FALL_LEAST || ++expose->fallen < FALL_CYCLES)
+    if (++expose->fallen < FALL_CYCLES)
         return;
     expose->fallen = 0;
-    expose->ambient_peak = sum;
+    expose->acquiring = 1;
     for (uint8_t i = 0; i < CHANNELS; i++) {
         if (expose->led[i].exposure_cycles < expose->led[i].most_cycles)
             expose->led[i].stage = SG_EXPOSE_ACQUIRE;
     }
 }
 
-uint8_t sg_expose_cycle(struct sg_expose *expose, const uint16_t lit_code[6], const uint16_t unlit_code[6],
-                        const uint16_t exposure_cycles[6])
+static uint8_t is_full(uint16_t lit, uint16_t unlit)
 {
-    uint8_t changed = 0, acquired = 0;
-    uint16_t sum = 0;
+    return lit >= SG_EXPOSE_SATURATED_CODE || unlit >= SG_EXPOSE_SATURATED_CODE;
+}
+
+// What does not wait for its turn. Returns 1 if an exposure changed.
+static uint8_t at_once(struct sg_expose *expose, const uint16_t lit_code[6], const uint16_t unlit_code[6],
+                       const uint16_t exposure_cycles[6])
+{
+    uint8_t changed = 0, acquired = 0, left = 0;
     struct sg_expose_led *led = expose->led;
     for (uint8_t i = 0; i < CHANNELS; i++, led++) {
         const uint16_t lit = lit_code[i], unlit = unlit_code[i];
-        sum = (uint16_t)(sum + unlit);
-        if (lit >= SG_EXPOSE_SATURATED_CODE || unlit >= SG_EXPOSE_SATURATED_CODE) {
+        if (is_full(lit, unlit)) {
             changed |= full(led, unlit, exposure_cycles[i]);
         } else if (led->stage <= SG_EXPOSE_REFINE && acquired < ACQUIRED_A_CYCLE
                    && exposure_cycles[i] == led->exposure_cycles) {
             changed |= acquire(led, lit, unlit);
             acquired++;
         }
+        left |= led->stage <= SG_EXPOSE_REFINE;
     }
-    const uint8_t next = expose->next;
-    led = &expose->led[next];
-    if (led->stage >= SG_EXPOSE_VERIFY && exposure_cycles[next] == led->exposure_cycles
-        && lit_code[next] < SG_EXPOSE_SATURATED_CODE && unlit_code[next] < SG_EXPOSE_SATURATED_CODE)
-        changed |= look(led, lit_code[next], unlit_code[next]);
-    if (next < CHANNELS - 1U) {
-        expose->next = (uint8_t)(next + 1U);
-    } else {
-        expose->next = 0;
-        if (++expose->looks >= SLOW_LOOKS) {
-            expose->looks = 0;
-            for (uint8_t i = 0; i < CHANNELS; i++)
-                expose->led[i].caution = (uint8_t)(expose->led[i].caution - (expose->led[i].caution != 0));
-        }
-    }
-    watch_ambient(expose, sum);
-    if (changed)
-        expose->ambient_peak = expose->fallen = 0;
+    expose->acquiring = left;
     return changed;
+}
+
+static void forget_caution(struct sg_expose *expose)
+{
+    expose->rounds = 0;
+    for (uint8_t i = 0; i < CHANNELS; i++) {
+        struct sg_expose_led *led = &expose->led[i];
+        led->caution = (uint8_t)(led->caution - (led->caution != 0));
+    }
+}
+
+uint8_t sg_expose_cycle(struct sg_expose *expose, const uint16_t lit_code[6], const uint16_t unlit_code[6],
+                        const uint16_t exposure_cycles[6])
+{
+    uint8_t urgent = expose->acquiring;
+    for (uint8_t i = 0; i < CHANNELS; i++)
+        urgent |= lit_code[i] >= SG_EXPOSE_SATURATED_CODE;
+    uint8_t changed = 0;
+    if (urgent)
+        changed = at_once(expose, lit_code, unlit_code, exposure_cycles);
+
+    const uint8_t next = expose->next;
+    struct sg_expose_led *led = &expose->led[next];
+    expose->next = next < CHANNELS - 1U ? (uint8_t)(next + 1U) : 0;
+    if (next == 0 && ++expose->rounds >= SLOW_ROUNDS)
+        forget_caution(expose);
+    const uint16_t lit = lit_code[next], unlit = unlit_code[next];
+    if (led->stage < SG_EXPOSE_VERIFY || exposure_cycles[next] != led->exposure_cycles || is_full(lit, unlit))
+        return changed;
+    watch_ambient(expose, led, unlit);
+    return changed | look(led, lit, unlit);
 }

@@ -49,11 +49,10 @@ enum sg_expose_stage {
 
 struct sg_expose {
     struct sg_expose_led led[6];
-    uint16_t ambient_peak;      // sum of the unlit codes, the largest of late
-    uint8_t fallen;             // cycles in a row that it was less than a sixteenth of that
+    uint8_t acquiring;          // 1: some may be
+    uint8_t fallen;             // looks in a row that found an unlit code of less than a sixteenth of its peak
     uint8_t next;               // channel to look at
-    uint8_t looks;              // rounds of looks, for what is slow
-    uint8_t reserved;
+    uint8_t rounds;             // of looks, for what is slow
 };
 
 // Begin at these exposures (clipped), with these limits. To hold exposures, start them there and call only
