@@ -141,7 +141,7 @@ class FakeDevice:
             cpu_hz=16_000_000,
             exposure_min_us=4,
             exposure_max_us=330,
-            slot_bytes=2048,
+            slot_bytes=1536,
             trial_bytes=0,
         )
         self.port, self.baud = "PORT", 1_000_000

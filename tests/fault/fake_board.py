@@ -10,7 +10,7 @@ import tty
 from sparsegaze import wire
 from sparsegaze.wire import ffi, lib
 
-SLOTS, SLOT_BYTES = (0x6800, 0x7000), 2048     # the Nano's model slots
+SLOTS, SLOT_BYTES = (0x6C00, 0x7200), 1536     # the Nano's model slots
 SPEED_BOOTLOADER = {termios.B115200: 115200, termios.B57600: 57600}
 
 

@@ -57,7 +57,7 @@ def test_the_last_byte_of_the_application_area_fits_and_the_next_does_not(tmp_pa
     pages, n = load_hex(make_hex(tmp_path / "full.hex", data))
     assert n == len(data) and len(pages) == APPLICATION_BYTES // 128
     message = refused(make_hex(tmp_path / "over.hex", data + b"\0"))
-    assert "0x6800" in message and "0x67FF" in message
+    assert "0x6C00" in message and "0x6BFF" in message
 
 
 def test_a_bootloader_hex_is_not_an_application(tmp_path):
@@ -80,11 +80,11 @@ def test_pages_between_the_parts_of_a_program_are_left_alone(tmp_path):
 @pytest.mark.parametrize("speed, name", [(termios.B115200, "Optiboot"), (termios.B57600, "ATmegaBOOT")])
 def test_the_bootloader_speed_is_found_by_trying(program, speed, name):
     with FakeBoard(boot_speed=speed) as board:
-        board.flash[0x6800:0x7800] = marks = bytes(range(256)) * 16
+        board.flash[0x6C00:0x7800] = marks = bytes(range(256)) * 12
         report = flash_hex(board.port, program[0])
         assert (report.bootloader, report.verified, report.bytes) == (name, True, 1000)
         assert board.flash[:1000] == program[1] and board.flash[1000:1024] == b"\xff" * 24
-        assert board.flash[0x6800:0x7800] == marks
+        assert board.flash[0x6C00:0x7800] == marks
         assert board.writes == [0, 128, 256, 384, 512, 640, 768, 896, 0]
 
 

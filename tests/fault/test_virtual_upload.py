@@ -10,7 +10,7 @@ from sparsegaze.device import Device
 from sparsegaze.errors import DisconnectedError, FlashError, ModelError, NoDeviceError
 from sparsegaze.wire import ffi, lib
 
-MOST_VECTORS = 147             # of 12 bytes, with the smallest grid, in a slot of the Nano
+MOST_VECTORS = 105             # of 12 bytes, with the smallest grid, in a slot of the Nano
 
 CYCLES_PER_MS = 16000
 # A page takes about 20 ms: its address, 133 bytes at 115200 baud, erasing, programming.
