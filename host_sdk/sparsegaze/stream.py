@@ -12,6 +12,11 @@ _PARTS = {lib.SG_MSG_RAW: ("raw", Raw, lib.SG_STREAM_RAW),
           lib.SG_MSG_COUNTS: ("counts", Counts, lib.SG_STREAM_COUNTS)}
 
 
+TURN = 1 << 16                  # numbers of frames
+LONG_US = 10_000_000            # within which they cannot come half round, at any rate
+NEAR_FRAMES = 64                # this near, two frames tell the period
+
+
 class Assembler:
     """Collects RAW, GAZE and COUNTS packets into frames.
 
@@ -63,6 +68,7 @@ class Assembler:
         self._seq = Unwrap(16)
         self._time = Unwrap(32)
         self._last_seq = None
+        self._period_us = 0.0
         self._close()
 
     def _close(self):
@@ -75,19 +81,24 @@ class Assembler:
             return
         if self._time.last is None:
             self._time.rebase(self._t_us, self._near(self._t_us))
-        step = self._seq.step(self._open_seq)
-        if self._last_seq is not None and self._time.step(self._t_us) < 0:
+        step, elapsed_us = self._seq.step(self._open_seq), self._time.step(self._t_us)
+        if self._last_seq is not None and elapsed_us < 0:
             # Only a restart sets device time back. Numbering goes on, so that nobody sees time run backwards.
             self.restarts += 1
             seq, t_us = self._seq.last + 1, self._time.last + 1
             self._begin_at(seq, t_us)
         else:
+            step += self._turns(step, elapsed_us)
             if step > 1:
                 self.lost += step - 1
             elif self._last_seq is not None and step == 0:
                 self._close()           # the same frame again
                 return
-            seq, t_us = self._seq(self._open_seq), self._time(self._t_us)
+            seq = self._open_seq if self._last_seq is None else self._last_seq + step
+            self._seq.rebase(self._open_seq, seq)
+            t_us = self._time(self._t_us)
+            if 0 < step < NEAR_FRAMES:
+                self._period_us = elapsed_us / step
         self._last_seq = seq
         if self._bits & ~self._have:
             self.incomplete += 1
@@ -98,6 +109,13 @@ class Assembler:
                                       raw=self._parts.get("raw"),
                                       gaze=self._parts.get("gaze"), counts=self._parts.get("counts")))
         self._close()
+
+    def _turns(self, step, elapsed_us):
+        """Frames to add to a step of the 16-bit numbers, which come round once a minute at 1 kHz: whole turns
+        that have passed unseen, by device time."""
+        if self._last_seq is None or not self._period_us or elapsed_us < LONG_US:
+            return 0
+        return TURN * round((elapsed_us / self._period_us - step) / TURN)
 
     def _begin_at(self, seq, t_us):
         """After a restart: continue unwrapping so that the present packet becomes `seq` at `t_us`."""

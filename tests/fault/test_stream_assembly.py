@@ -10,7 +10,7 @@ from sparsegaze.device import Frame
 from sparsegaze.stream import Assembler
 from sparsegaze.wire import lib
 
-PERIOD_US = 3840
+PERIOD_US = 999
 
 
 def packet(kind, seq, t_us):
@@ -42,6 +42,15 @@ def test_a_gap_in_the_numbers_is_lost_frames_across_the_wrap_of_sixteen_bits():
     frames, done = assembled(both(65534, 0) + both(65535, PERIOD_US) + both(2, 4 * PERIOD_US))
     assert [frame.seq for frame in done] == [65534, 65535, 65538]
     assert frames.lost == 2
+
+
+@pytest.mark.parametrize("gap", [3, 30_000, 32_768, 40_000, 65_535, 65_536, 65_537, 500_000])
+@pytest.mark.parametrize("period_us", [999, 3840])
+def test_a_gap_longer_than_the_numbers_go_round_is_counted_by_device_time(gap, period_us):
+    times = [0, 1, 2, 2 + gap, 3 + gap]
+    frames, done = assembled([item for k in times for item in both(k, k * period_us + (k % 3) * 20)])
+    assert [frame.seq for frame in done] == times and frames.lost == gap - 1
+    assert frames.restarts == 0 and np.all(np.diff([frame.t_us for frame in done]) > 0)
 
 
 def test_device_time_wraps_after_71_minutes_and_goes_on():
