@@ -23,7 +23,7 @@ enum {
     CYCLES_PER_US = SG_EXPOSE_CYCLES_PER_US,
     PERIOD_LEAST_US = 999,      // 18 conversions as close as the converter can, 888 cycles,
     PERIOD_MOST_US = 1998,      // and as far apart as the port's timer reaches
-    PAUSE_US = 20,              // dark for longer than this is a pause
+    PAUSE_US = 4,               // dark for longer than this is a pause; shorter is not worth shorter exposures
     ROOMY_US = 500,             // the costliest request
     BYTE_US = 10,               // on the line at 1 Mbaud
     PACKET_BYTES = SG_WIRE_FRAME_MAX - SG_WIRE_BODY_MAX,
@@ -114,6 +114,10 @@ SELDOM void app_rate_start(struct hal_timing *timing)
         if (period > PERIOD_MOST_US)
             period = PERIOD_MOST_US;
     }
+    const uint16_t dark = frame - (uint16_t)(period << shift);
+    app.pause = dark > PAUSE_US;
+    if (!app.pause)
+        frame -= dark;
     memset(timing, 0, sizeof *timing);
     timing->period_cycles = period * CYCLES_PER_US;
     timing->frame_cycles = (uint32_t)frame * CYCLES_PER_US;
@@ -123,9 +127,7 @@ SELDOM void app_rate_start(struct hal_timing *timing)
     timing->probe = app.probe;
     timing->sleep = app_live.power == SG_POWER_LOW;
     // What is left of the time until the next frame's first cycle is complete.
-    const uint16_t dark = frame - (uint16_t)(period << shift);
-    const uint16_t spare = dark + period - work_us();
-    app.pause = dark > PAUSE_US;
+    const uint16_t spare = frame - (uint16_t)(period << shift) + period - work_us();
     app.infer_fits = !app.sensed || spare >= infer_us();
     app.roomy = !app.sensed || spare >= ROOMY_US;
 }

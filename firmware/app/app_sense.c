@@ -151,7 +151,7 @@ static void look_at(const struct sg_reading *reading)
     sight.unlit_code = reading->unlit_code[i];
     sight.before_code = pair < HAL_CHANNELS ? reading->lit_code[pair] : 0;
     sight.exposure_cycles = reading->exposure_cycles[i];
-    sight.most_cycles = hal_exposure_most(i);
+    sight.most_cycles = app.expose.led[i].most_cycles;
     sight.feature = app.feature[i];
     sg_track_range(app_model(), i, &sight);
     faulty = sg_health_look(&app.health, i, &sight);

@@ -13,8 +13,8 @@ from sparsegaze.model import CHANNELS, DeviceModel
 from sparsegaze.trust import Trust
 
 FLASH_BYTES = 32768
-SLOT_BASE = (0x6800, 0x7000)
-NANO_SLOT_BYTES = 2048
+SLOT_BASE = (0x6C00, 0x7200)
+NANO_SLOT_BYTES = 1536
 
 
 def random_model(vectors, seed=0, generation=1, channels=CHANNELS):

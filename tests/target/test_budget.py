@@ -74,7 +74,7 @@ def test_inference_takes_the_same_time_for_every_input_inside_the_range(board):
 def test_stack_beside_the_static_data_after_everything_was_used(board, avr_tools, firmware_elf):
     static = static_ram(avr_tools, firmware_elf)
     model = random_model(64)
-    nano, device = board(models={0: model.image, 1: random_model(140, generation=0).image})
+    nano, device = board(models={0: model.image, 1: random_model(100, generation=0).image})
     device.set_stream(raw=True, gaze=True, counts=True)
     device.infer(random_features(40))
     device.trial(random_model(48, seed=3).image)

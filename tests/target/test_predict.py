@@ -24,7 +24,7 @@ from sparsegaze.predict import CYCLES_EXACT, INSTRUCTIONS, REQUEST_SECTION, pred
 from sparsegaze.recording import Recording
 
 MODELS = {"64 vectors": (64, 6), "one vector, one channel": (1, 1), "three channels": (20, 3),
-          "140 vectors": (140, 6)}
+          "100 vectors": (100, 6)}
 
 
 def hard_features(n=500, seed=0):

@@ -34,7 +34,7 @@ def test_hello_says_what_the_board_is(board):
     hello = device.hello
     assert (hello.wire_version, hello.model_version) == (lib.SG_WIRE_VERSION, lib.SG_MODEL_VERSION)
     assert hello.board == lib.SG_BOARD_NANO328P and hello.channels == 6 and hello.cpu_hz == 16_000_000
-    assert hello.slot_base == (0x6800, 0x7000) and hello.slot_bytes == 2048
+    assert hello.slot_base == (0x6C00, 0x7200) and hello.slot_bytes == 1536
     assert hello.page_bytes == 128 and hello.frame_period_us == 999
     assert hello.trial_bytes == 0
     assert 0 < hello.exposure_min_us < hello.exposure_max_us <= 326
@@ -95,7 +95,7 @@ def test_longer_body_is_accepted_and_its_excess_ignored(board, kind):
     (lib.SG_MSG_MODEL_READ, b"\0\0\x03\1", lib.SG_E_ARG),
     (lib.SG_MSG_MODEL_READ, b"\0\0\x00\0", lib.SG_E_ARG),
     (lib.SG_MSG_MODEL_READ, b"\0\0\x00\x31", lib.SG_E_ARG),
-    (lib.SG_MSG_MODEL_READ, b"\xd1\x07\x00\x30", lib.SG_E_BOUNDS),      # 2001 + 48 > 2048
+    (lib.SG_MSG_MODEL_READ, b"\xd1\x05\x00\x30", lib.SG_E_BOUNDS),      # 1489 + 48 > 1536
     (lib.SG_MSG_MODEL_READ, b"\xff\xff\x00\x01", lib.SG_E_BOUNDS),
     (lib.SG_MSG_MODEL_READ, b"\x80\x02\x02\x01", lib.SG_E_BOUNDS),      # no room for a trial
     (lib.SG_MSG_TRIAL_WRITE, b"\x80\x02\x02\x01x", lib.SG_E_BOUNDS),
@@ -210,7 +210,7 @@ def test_answers_survive_a_flood_and_dropped_frames_are_counted(board):
 
 
 def test_a_second_verification_at_once_is_refused_busy_and_the_first_answered(board):
-    _, device = board(models={0: random_model(140).image})
+    _, device = board(models={0: random_model(100).image})
     body = wire.body("struct sg_model_at", slot=0)
     kind = lib.SG_MSG_MODEL_VERIFY
     packets = exchange(device, wire.encode(kind, 1, body) + wire.encode(kind, 2, body), 0.2)

@@ -107,7 +107,7 @@ def test_settings_that_do_not_exist_are_refused_and_change_nothing(board, field,
 
 
 def test_a_rate_beyond_the_limit_is_the_limit(board):
-    _, device = board(models={0: random_model(140).image})
+    _, device = board(models={0: random_model(100).image})
     device.set_stream(gaze=True)
     now = device.settings(rate_hz=1000)
     assert 300 < now.rate_limit_hz < 450 and now.rate_hz == now.rate_limit_hz
@@ -132,7 +132,7 @@ def test_the_limit_follows_the_streams_and_the_line_and_the_wish_is_kept(board):
     calm(device)
 
 
-@pytest.mark.parametrize("vectors", [0, 1, 30, 64, 140])
+@pytest.mark.parametrize("vectors", [0, 1, 30, 64, 100])
 def test_no_frame_is_late_with_any_model_streams_and_repeats(board, vectors):
     """The estimate of the work of a frame is above what it takes, and not far above."""
     models = {0: costly_model([42000] * 6, vectors).image} if vectors else None
