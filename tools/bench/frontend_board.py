@@ -45,7 +45,7 @@ class Board:
         except BaseException:
             self.nano.stop()
             raise
-        self._raw = None
+        self._streams = None
 
     def __enter__(self):
         return self
@@ -68,18 +68,21 @@ class Board:
         """Virtual time."""
         return self.control.time().us
 
-    def frames(self, seconds, raw=False):
-        """The stream of so much device time from now on, as an array of FRAME; without gaze nan."""
-        if self._raw != raw:
-            self.device.set_stream(gaze=True, raw=raw)
-            self._raw = raw
+    def frames(self, seconds, gaze=True, raw=False):
+        """The stream of so much device time from now on, as an array of FRAME; without gaze nan.
+
+        With both streams a frame that lacks one, because the line was full, is left out.
+        """
+        if self._streams != (gaze, raw):
+            self.device.set_stream(gaze=gaze, raw=raw)
+            self._streams = gaze, raw
         rows, begin = [], self.now_us() + self.offset_us
         for frame in self.device.frames(5.0):
-            if frame.t_us < begin:
+            if frame.t_us < begin or (gaze and not frame.gaze) or (raw and not frame.raw):
                 continue
-            gaze, features = frame.gaze, frame.raw.feature if frame.raw else (0,) * 6
-            place = (gaze.azimuth_deg, gaze.elevation_deg) if gaze else (np.nan, np.nan)
-            flags = gaze.flags if gaze else frame.raw.flags if frame.raw else 0
+            found, features = frame.gaze, frame.raw.feature if frame.raw else (0,) * 6
+            place = (found.azimuth_deg, found.elevation_deg) if found else (np.nan, np.nan)
+            flags = (found or frame.raw).flags
             rows.append((frame.seq, frame.t_us, place, flags, tuple(features)))
             if frame.t_us - begin >= seconds * 1e6:
                 return np.array(rows, FRAME)
@@ -90,7 +93,7 @@ class Board:
         self.control.targets_clear()
         self.control.target(self.now_us(), azimuth_deg, elevation_deg)
 
-    def grid(self, places=None, dwell_s=DWELL_S, skip_s=SKIP_S, raw=False):
+    def grid(self, places=None, dwell_s=DWELL_S, skip_s=SKIP_S, gaze=True, raw=False):
         """Frames over places [k, 2] (the grid within +-20 degrees), one after the other, with their targets.
 
         Returns (frames, target_deg [n, 2], index [n]); index -1 while a place is new.
@@ -100,7 +103,7 @@ class Board:
         self.control.targets_clear()
         for k, (azimuth, elevation) in enumerate(places):
             self.control.target(int(start + k * dwell_s * 1e6), azimuth, elevation)
-        frames = self.frames(LEAD_US * 1e-6 + len(places) * dwell_s, raw)
+        frames = self.frames(LEAD_US * 1e-6 + len(places) * dwell_s, gaze, raw)
         since = (frames["t_us"] - self.offset_us - start) * 1e-6
         index = np.floor(since / dwell_s).astype(int)
         within = since - index * dwell_s

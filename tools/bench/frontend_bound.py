@@ -28,7 +28,7 @@ def noise(board, map_path, light):
 
     ratio [6]   measured over expected RMS, mean over the grid; bound_deg, bound_250_deg   RMS-S2S, mean over the grid
     """
-    frames, _, index = board.grid(dwell_s=PLACE_S, skip_s=SKIP_S, raw=True)
+    frames, _, index = board.grid(dwell_s=PLACE_S, skip_s=SKIP_S, gaze=False, raw=True)
     exposure = np.array(board.device.exposure().exposure_us)
     pupil = board.control.state().pupil_mm
     places = grid_places()

@@ -78,8 +78,8 @@ def saturated_after(frames, free=FREE_FRAMES):
 
 
 def rate_of(frames):
-    """Frames per second of device time."""
-    return float((frames["seq"][-1] - frames["seq"][0]) / (frames["t_us"][-1] - frames["t_us"][0]) * 1e6)
+    """Frames received per second of device time."""
+    return float((len(frames) - 1) / (frames["t_us"][-1] - frames["t_us"][0]) * 1e6)
 
 
 def flicker(board):
@@ -122,22 +122,21 @@ def judge_steps(frames, error, begin):
     rows = rows[rows[:, -1] < len(frames)]
     saturated = ((frames["flags"][rows] & lib.SG_FLAG_SATURATED) != 0).sum(axis=1)
     table = error[rows]
-    steady = float(np.nanmean(table[:, STEADY]))
     whole = np.isfinite(table)
+    steady = float(np.mean(table[:, STEADY], where=whole[:, STEADY])) if whole[:, STEADY].any() else np.nan
     settle = None
     for k in range(STEADY.start):
         window = table[:, k : k + WINDOW]
-        if whole[:, k : k + WINDOW].mean() >= 0.99 and np.nanmean(window) <= SETTLED * steady:
+        if whole[:, k : k + WINDOW].mean() >= 0.99 and np.mean(window, where=np.isfinite(window)) <= SETTLED * steady:
             settle = k
             break
-    with np.errstate(all="ignore"):
-        course = [float(np.nanmean(column)) if np.isfinite(column).any() else None for column in table.T]
+    course = [float(np.nanmean(column)) if np.isfinite(column).any() else None for column in table.T]
     return {
         "saturated_frames": int(saturated.max()),
         "settle_frames": settle,
         "steady_deg": steady,
-        "worst_valid_deg": float(np.nanmax(table[:, : STEADY.start])),
-        "steady_worst_deg": float(np.nanmax(table[:, STEADY])),
+        "worst_valid_deg": float(np.max(table[:, : STEADY.start], initial=0.0, where=whole[:, : STEADY.start])),
+        "steady_worst_deg": float(np.max(table[:, STEADY], initial=0.0, where=whole[:, STEADY])),
         "course_deg": course,
         "valid": [float(v) for v in whole.mean(axis=0)],
         "steps": len(rows),

@@ -101,7 +101,7 @@ def worst(rows):
 
     def most(get):
         values = [get(row) for row in rows]
-        return None if any(value is None for value in values) else max(values)
+        return None if any(value is None or np.isnan(value) for value in values) else max(values)
 
     def ratios(row, key, field):
         table = row[key]
