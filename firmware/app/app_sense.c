@@ -8,6 +8,7 @@
 
 enum {
     EMITTERS_PHOTODIODES = 3,
+    HEALTH_TURNS = 8,           // cycles from one look at the health of a channel to the next channel's; 2^n
     // Cycles of a probe, counted down: until the emitter is alone, its readings, until all is as before.
     PROBE_BEFORE = 4,
     PROBE_SUM = SG_LIGHT_REPEATS_MAX,
@@ -23,7 +24,8 @@ static const uint8_t before[2][HAL_CHANNELS] SG_ROM = {
 static struct hal_timing timing;        // in force
 static uint16_t wanted_mark;            // CRC of what was asked for: the port may have taken something close to it
 static uint8_t faulty;                  // a channel is
-static uint8_t look;                    // at this channel next
+static uint8_t turn;
+static uint8_t look;                    // at the health of this channel next
 static uint16_t probe_seq;
 static uint8_t probe_cycles;            // to come
 
@@ -164,10 +166,12 @@ void app_sense_cycle(const struct hal_cycle *cycle)
     // In the dark there is nothing to learn.
     if (app_alarm() & (SG_ALARM_LOCKOUT | SG_ALARM_LIGHTS_OFF))
         return;
-    if (app_live.exposure_auto
-        && sg_expose_cycle(&app.expose, reading->lit_code, reading->unlit_code, reading->exposure_cycles))
+    // One or the other: what a cycle takes at most counts.
+    if ((++turn & (HEALTH_TURNS - 1)) == 0)
+        look_at(reading);
+    else if (app_live.exposure_auto
+             && sg_expose_cycle(&app.expose, reading->lit_code, reading->unlit_code, reading->exposure_cycles))
         exposures_moved();
-    look_at(reading);
 }
 
 SELDOM int8_t app_probe(uint8_t emitter, uint16_t seq)
