@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-// A small application on the real port. It answers anything said to it, and misbehaves on purpose if BAD says so:
-//   NOTHING      it is well behaved
+// A small application on the real port. It does what it is told and misbehaves on purpose if BAD says so:
+//   NOTHING      it does not
 //   HANG_LOOP    from the 400th cycle on the main loop stands, the sensing engine runs on
 //   HANG_LIT     the same, with interrupts off at a moment when emitters are lit
 //   BLOCK        interrupts are off for 250 us in every 16th cycle, later and later in it
+//   SHORT_BLOCK  the same for 6 us
 //   SLOW         5 ms of work for cycles that come every millisecond
-// What it is asked for is a command and its arguments, little endian, without any frame around (run_app() in
-// sensing_app.py).
+// It is told by bytes without any frame around them: a letter and structs as they lie in memory (port_app.py).
+// It answers in packets of PROTOCOL.md's coding whose bodies are structs as they lie in memory.
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <string.h>
@@ -14,25 +15,38 @@
 
 #include "hal.h"
 
-enum { NOTHING, HANG_LOOP, HANG_LIT, BLOCK, SLOW };
+enum { NOTHING, HANG_LOOP, HANG_LIT, BLOCK, SHORT_BLOCK, SLOW };
+enum { TYPE_CYCLE = 0x50, TYPE_EXPOSURE = 0x51, TYPE_TIMING = 0x52, TYPE_NOISE = 0x53 };
 
 static uint16_t cycles;
-static struct hal_cycle last;
+static uint8_t cycles_wanted;           // cycles are sent
+static uint8_t noise;                   // the line is kept full
+static uint16_t exposure_cycles[HAL_CHANNELS] = { 1600, 1600, 1600, 1600, 1600, 1600 };
+static struct hal_timing timing = { .period_cycles = 15984, .repeats = 1, .lights = 1, .probe = 255 };
+static uint8_t told[1 + sizeof timing > 1 + sizeof exposure_cycles ? 1 + sizeof timing : 1 + sizeof exposure_cycles];
+static uint8_t told_bytes;
+
+static void answer(uint8_t type, const void *body, uint8_t n)
+{
+    struct sg_head head = { .seq = cycles, .type = type, .flags = 0 };
+    hal_send(&head, body, n, 0);
+}
 
 void app_on_cycle(const struct hal_cycle *cycle)
 {
     cycles++;
-    last = *cycle;
+    if (cycles_wanted)
+        answer(TYPE_CYCLE, cycle, sizeof *cycle);
     if (BAD == SLOW)
         _delay_ms(5);
-    if (BAD == BLOCK && cycles % 16 == 0) {
-        for (uint8_t i = cycles / 16 & 31; i != 0; i--)
-            _delay_us(30);
+    if ((BAD == BLOCK || BAD == SHORT_BLOCK) && cycles % 16 == 0) {
+        for (uint8_t i = cycles / 16 & 63; i != 0; i--)
+            _delay_us(13);
         cli();
-        _delay_us(250);
+        _delay_us(BAD == BLOCK ? 250 : 6);
         sei();
     }
-    if (cycles < 400 || BAD == SLOW || BAD == BLOCK || BAD == NOTHING)
+    if (cycles < 400 || (BAD != HANG_LIT && BAD != HANG_LOOP))
         return;
     if (BAD == HANG_LIT) {
         // Lit are four of the six pins: look until one sees it, then stop the world.
@@ -44,25 +58,64 @@ void app_on_cycle(const struct hal_cycle *cycle)
     }
 }
 
-void app_on_byte(uint8_t byte, uint32_t zero_us)
+static void report(void)
 {
     struct sg_status status;
-    struct sg_head head = { .seq = 1, .type = SG_MSG_STATUS | SG_REPLY, .flags = 0 };
-    (void)zero_us;
-    if (byte != 0)
-        return;
     memset(&status, 0, sizeof status);
     hal_report(&status);
-    hal_send(&head, &status, sizeof status, 0);
+    answer(SG_MSG_STATUS | SG_REPLY, &status, sizeof status);
+}
+
+void app_on_byte(uint8_t byte, uint32_t zero_us)
+{
+    (void)zero_us;
+    if (told_bytes < sizeof told)
+        told[told_bytes++] = byte;
+    uint8_t n = 1;
+    switch (told[0]) {
+    case 'e':
+        n = 1 + sizeof exposure_cycles;
+        break;
+    case 't':
+        n = 1 + sizeof timing;
+        break;
+    case 'c':
+    case 'n':
+        n = 2;
+        break;
+    }
+    if (told_bytes < n)
+        return;
+    told_bytes = 0;
+    switch (told[0]) {
+    case 'e':
+        memcpy(exposure_cycles, told + 1, sizeof exposure_cycles);
+        hal_expose(exposure_cycles);
+        answer(TYPE_EXPOSURE, exposure_cycles, sizeof exposure_cycles);
+        break;
+    case 't':
+        memcpy(&timing, told + 1, sizeof timing);
+        hal_set_timing(&timing);
+        answer(TYPE_TIMING, &timing, sizeof timing);
+        break;
+    case 'c':
+        cycles_wanted = told[1];
+        break;
+    case 'n':
+        noise = told[1];
+        break;
+    case 's':
+        report();
+        break;
+    }
 }
 
 int main(void)
 {
-    uint16_t exposure_cycles[HAL_CHANNELS] = { 1600, 1600, 1600, 1600, 1600, 1600 };
-    struct hal_timing timing = { .period_cycles = 15984, .repeats = 1, .lights = 1, .probe = 255 };
     hal_boot();
     hal_start(&timing, exposure_cycles);
     while (hal_poll())
-        ;
+        if (noise)
+            answer(TYPE_NOISE, &timing, sizeof timing);
     return 0;
 }

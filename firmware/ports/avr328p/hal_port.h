@@ -6,7 +6,7 @@
 #include <avr/io.h>
 
 enum {
-    HAL_TRIAL_BYTES = 640,      // small models; a tenth of 2 KiB stays free
+    HAL_TRIAL_BYTES = 0,        // none: RAM is short
     HAL_SLOT_SPACE = 1,         // SG_ROM_FLASH: slots are read through LPM
     HAL_RECORD_MAX = 56,        // live state
 };

@@ -1,18 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
-// From exposures to a list of events for the sensing interrupt. A cycle is six half phases of three slots: GND, a,
-// b of each pair, lit and then unlit. What happens before a half phase's samples begins right after the sample
+// From exposures to lists of events for the sensing interrupt: one for each pair of sensors, run through lit and
+// again unlit, three slots each: GND, a, b. What happens before a half's samples begins right after the sample
 // before them, in the slot before its first.
 //
 // Samples are fixed, releases follow from the exposures, services have most of a slot to choose from: where a
-// release is near, it comes first and the service after it. Only two releases of one half phase can be in each
-// other's way; plan_clip() moves the second sensor's exposure then.
+// release is near, it comes first and the service after it. Only two releases of one half can be in each other's
+// way; plan_clip() moves the second sensor's exposure then.
 #include "port_sense.h"
 
-enum { SECONDS_LEDS = 1 << 0 | 1 << 4 | 1 << 3, SECONDS_PHOTODIODES = 1 << 3 | 1 << 4 | 1 << 5 };
+#include <avr/pgmspace.h>
 
-static const uint8_t pair[2][3][2] = {
-    [SG_WIRING_LEDS] = { { 5, 0 }, { 1, 4 }, { 2, 3 } },
-    [SG_WIRING_PHOTODIODES] = { { 0, 3 }, { 1, 4 }, { 2, 5 } },
+#pragma GCC optimize("Os")          // runs when an exposure changes
+
+const uint8_t plan_place[2][HAL_CHANNELS] PROGMEM = {
+    [SG_WIRING_LEDS] = { 5, 0, 1, 4, 2, 3 },
+    [SG_WIRING_PHOTODIODES] = { 0, 3, 1, 4, 2, 5 },
 };
 
 struct plan sense_plan[2];
@@ -20,146 +22,144 @@ struct plan sense_plan[2];
 // The list being written.
 static uint8_t *to;
 static uint8_t *word;                   // of the event before
-static int16_t match;                   // its compare match, from the trigger of the half phase's first slot
+static int16_t match;                   // its compare match, from the trigger of the half's first slot
 
-uint8_t plan_channel(uint8_t wiring, uint8_t phase, uint8_t second)
+uint8_t plan_channel(uint8_t wiring, uint8_t place)
 {
-    return pair[wiring != SG_WIRING_LEDS][phase][second];
-}
-
-uint16_t plan_exposure_most(uint8_t channel, uint8_t wiring, uint16_t slot_cycles)
-{
-    const uint8_t seconds = wiring == SG_WIRING_LEDS ? SECONDS_LEDS : SECONDS_PHOTODIODES;
-    return 2 * slot_cycles + (seconds >> channel & 1 ? slot_cycles : 0) - EXPOSURE_LESS_CYCLES;
+    return pgm_read_byte(&plan_place[wiring != SG_WIRING_LEDS][place]);
 }
 
 void plan_clip(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t wiring, uint16_t slot_cycles)
 {
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-        const uint16_t most = plan_exposure_most(i, wiring, slot_cycles);
-        if (exposure_cycles[i] < EXPOSURE_MIN_CYCLES)
-            exposure_cycles[i] = EXPOSURE_MIN_CYCLES;
-        if (exposure_cycles[i] > most)
-            exposure_cycles[i] = most;
-    }
-    for (uint8_t phase = 0; phase < 3; phase++) {
-        // b is sampled a slot after a: the same release is a slot more.
-        uint16_t *b = &exposure_cycles[plan_channel(wiring, phase, 1)];
-        const uint16_t same = exposure_cycles[plan_channel(wiring, phase, 0)] + slot_cycles;
-        const int16_t apart = *b - same;
-        if (apart > -EXPOSURES_APART_CYCLES / 2 && apart < EXPOSURES_APART_CYCLES / 2)
-            *b = same;
-        else if (apart > 0 && apart < EXPOSURES_APART_CYCLES)
-            *b = same + EXPOSURES_APART_CYCLES;
-        else if (apart < 0 && apart > -EXPOSURES_APART_CYCLES)
-            *b = same - EXPOSURES_APART_CYCLES;
+    uint16_t same = 0;                  // exposure with the release of the pair's first
+    for (uint8_t place = 0; place < HAL_CHANNELS; place++) {
+        const uint8_t second = place & 1;
+        uint16_t *cycles = &exposure_cycles[plan_channel(wiring, place)];
+        const uint16_t most = (second ? 3 : 2) * slot_cycles - EXPOSURE_LESS_CYCLES;
+        if (*cycles < EXPOSURE_MIN_CYCLES)
+            *cycles = EXPOSURE_MIN_CYCLES;
+        if (*cycles > most)
+            *cycles = most;
+        const int16_t apart = *cycles - same;
+        if (second && apart > -EXPOSURES_APART_CYCLES && apart < EXPOSURES_APART_CYCLES) {
+            *cycles = same;
+            if (apart <= -EXPOSURES_APART_CYCLES / 2)
+                *cycles -= EXPOSURES_APART_CYCLES;
+            if (apart >= EXPOSURES_APART_CYCLES / 2)
+                *cycles += EXPOSURES_APART_CYCLES;
+            if (*cycles > most)
+                *cycles = same;
+        }
+        same = *cycles + slot_cycles;
     }
 }
 
-static void put(uint8_t byte)
-{
-    *to++ = byte;
-}
-
-static void event(uint16_t kind, int16_t at)
+static void event(uint8_t kind, int16_t at)
 {
     const uint16_t delta = at - match;
     word[0] = (uint8_t)delta;
     word[1] |= (uint8_t)(delta >> 8);
     match = at;
     word = to;
-    put(0);
-    put(kind >> 8);
+    to[0] = 0;
+    to[1] = kind;
+    to += 2;
 }
 
-static void half_phase(struct plan *plan, const struct hal_timing *timing, uint8_t half)
+static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lights, uint8_t phase)
 {
-    const uint8_t phase = half >> 1, lit = !(half & 1), wiring = timing->wiring;
     const int16_t slot = (int16_t)plan->slot_cycles;
-    const uint8_t a = plan_channel(wiring, phase, 0), b = plan_channel(wiring, phase, 1);
-    const int16_t hold_at = HOLD_AT - slot;
-    uint8_t portc = 0, portd = PORTD_DARK, left = 2;
-    uint8_t bits = 1 << a, more = 1 << b;
-    int16_t release = slot + SAMPLE_CYCLES - (int16_t)plan->exposure_cycles[a];
-    int16_t later = 2 * slot + SAMPLE_CYCLES - (int16_t)plan->exposure_cycles[b];
+    uint8_t *const begin = to;
+    uint8_t portc = 0, portd = PORTD_DARK, left = 2, set = 1, bits[2], admux[3];
+    int16_t release[2], service = HOLD_AT - slot;
 
-    if (wiring == SG_WIRING_LEDS) {
-        uint8_t emitters = PORTC_ALL & (uint8_t)~(bits | more);
-        if (timing->probe < HAL_CHANNELS) {
-            emitters = 1 << timing->probe;
-            bits &= (uint8_t)~emitters;
-            more &= (uint8_t)~emitters;
-        }
-        if (lit && timing->lights)
-            portc = emitters;
-    } else if (lit && timing->lights && (timing->probe >= HAL_CHANNELS || timing->probe == phase)) {
-        portd |= 1 << (FIRST_EMITTER + phase);
+    admux[0] = ADMUX_GROUND;
+    for (uint8_t k = 0; k < 2; k++) {
+        const uint8_t i = plan_channel(timing->wiring, 2 * phase + k);
+        admux[1 + k] = ADMUX_CHANNEL_0 + i;
+        bits[k] = 1 << i;
+        release[k] = (k + 1) * slot + SAMPLE_CYCLES - (int16_t)plan->exposure_cycles[i];
     }
-    if (release == later) {
-        bits |= more;
+    uint8_t emitters = PORTC_ALL & (uint8_t)~(bits[0] | bits[1]);
+    if (timing->probe < HAL_CHANNELS)
+        emitters = 1 << timing->probe;
+    if (timing->wiring != SG_WIRING_LEDS) {
+        if (timing->probe == phase || timing->probe >= HAL_CHANNELS)
+            portd |= 1 << (FIRST_EMITTER + phase);
+    } else {
+        // The only emitter is at 5 V when its turn comes: the converter is not to see that.
+        for (uint8_t k = 0; k < 2; k++)
+            if (bits[k] == emitters) {
+                bits[k] = 0;
+                admux[1 + k] = ADMUX_GROUND;
+            }
+        portc = emitters;
+    }
+    if (!lights) {
+        portc = 0;
+        portd = PORTD_DARK;
+    }
+    uint8_t next = release[1] < release[0];
+    uint8_t held = PORTC_ALL & (uint8_t)~bits[next];
+    if (release[0] == release[1]) {
+        held &= (uint8_t)~bits[1];
         left = 1;
-    } else if (later < release) {
-        const int16_t r = release;
-        const uint8_t m = bits;
-        release = later;
-        later = r;
-        bits = more;
-        more = m;
     }
 
-    uint8_t set = lit;              // the next release is the one that lights go on with
-    uint8_t begun = 0;
-    for (uint8_t slot_of = 0; slot_of < 4; slot_of++) {
-        int16_t service = slot_of == 0 ? hold_at : (slot_of - 1) * slot + SERVICE_AT;
+    for (uint8_t k = 0; k < 4; k++) {
+        uint8_t released = 0;
         while (left) {
-            const uint16_t kind = (set ? EVENT_SET_RELEASE : EVENT_RELEASE) | (lit ? 0 : EVENT_UNLIT);
-            int16_t begin = release - (set ? LIGHT_LEAD_CYCLES : RELEASE_LEAD_CYCLES);
-            if (slot_of < 3 && begin >= service + SPACING_CYCLES)
+            int16_t at = release[next] - (set ? LIGHT_LEAD_CYCLES : RELEASE_LEAD_CYCLES);
+            // A service right after a release costs no interrupt of its own; but lights go out in time.
+            if (k < 3 && at >= service + (k == 0 ? HOLD_CYCLES : SPACING_CYCLES)
+                && (k == 0 || release[next] > (int16_t)(k * slot) - SERVICE_BEFORE_CYCLES))
                 break;
-            if (!begun) {           // no time for holding first
-                set = 1;
-                begin = hold_at;
-            }
-            begun = 1;
-            event(set ? kind | EVENT_SET_RELEASE : kind, begin);
+            if (k == 0 && set)
+                at = service;           // no time for holding first
+            event((set ? EVENT_SET_RELEASE : EVENT_RELEASE) | EVENT_ALONE, at);
             if (set) {
-                put(portc);
-                put(portd);
-                put(release - begin);
+                *to++ = portc;
+                *to++ = portd;
+                *to++ = (uint8_t)(release[next] - at - LEAD_LESS_CYCLES);
             }
-            put(PORTC_ALL & (uint8_t)~bits);
-            if (service < release + AFTER_RELEASE_CYCLES)
-                service = release + AFTER_RELEASE_CYCLES;
-            release = later;
-            bits |= more;
+            *to++ = held;
+            // With the release, if the last sample has been taken long enough.
+            released = release[next] >= service + WITH_RELEASE_CYCLES;
+            if (service < release[next] + AFTER_RELEASE_CYCLES)
+                service = release[next] + AFTER_RELEASE_CYCLES;
+            next = !next;
+            held &= (uint8_t)~bits[next];
             set = 0;
             left--;
         }
-        if (slot_of == 3)
+        if (k == 3)
             break;
-        uint16_t kind = EVENT_SERVICE;
-        if (slot_of == 0)
-            kind = begun ? EVENT_STORE : EVENT_DARK_STORE;
-        else if (slot_of == 1)
-            kind = half == 0 ? EVENT_COMPLETE : EVENT_STORE;
-        else if (half == 0)
-            kind = EVENT_STORE;
-        event(kind, service);
-        if (half == 0 && slot_of == 0)
+        uint8_t kind = EVENT_STORE;
+        if (k == 0 && set)
+            kind = EVENT_DARK_STORE;
+        else if (k == 1 && phase == 0)
+            kind = EVENT_COMPLETE;
+        else if (k == 2 && phase != 0)
+            kind = EVENT_SERVICE;
+        if (released)
+            word[1] ^= EVENT_ALONE ^ kind;
+        else
+            event(kind, service);
+        if (k == 0 && phase == 0)
             plan->first_mux = to;
-        put(slot_of == 0 ? ADMUX_GROUND : ADMUX_CHANNEL_0 + (slot_of == 1 ? a : b));
-        begun = 1;
+        *to++ = admux[k];
+        service = k * slot + SERVICE_AT;
     }
+    event(phase == 2 ? EVENT_LAST : EVENT_AGAIN, 2 * slot + HOLD_AT);
+    *to = (uint8_t)(to - begin);
+    to++;
+    match -= 3 * slot;
 }
 
-void plan_write(struct plan *plan, const struct hal_timing *timing)
+void plan_write(struct plan *plan, const struct hal_timing *timing, uint8_t lights)
 {
-    const int16_t slot = (int16_t)plan->slot_cycles;
     to = plan->event;
     word = to;
-    for (uint8_t half = 0; half < 6; half++) {
-        half_phase(plan, timing, half);
-        match -= 3 * slot;
-    }
-    event(EVENT_END, HOLD_AT - slot);
+    for (uint8_t phase = 0; phase < 3; phase++)
+        pair(plan, timing, lights, phase);
 }

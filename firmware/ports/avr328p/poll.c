@@ -9,7 +9,7 @@ static uint8_t alive;
 
 void hal_describe(struct sg_hello *hello)
 {
-    hello->slot_bytes = SLOT_B - SLOT_A;
+    hello->slot_bytes = SLOT_BYTES;
     hello->slot_base[0] = SLOT_A;
     hello->slot_base[1] = SLOT_B;
     hello->cpu_hz = F_CPU;

@@ -6,39 +6,46 @@
 
 #include "port.h"
 
-// A plan is a list of events, each a little-endian word  kind | cycles to the next event's compare match, and what
-// the kind needs. A compare match comes some cycles before what it is for.
-enum event {
-    EVENT_CYCLES = 0x0FFF,
+// A plan is three lists of events, one for each pair of sensors, run twice each: lit and unlit. An event is a
+// little-endian word, kind in the four bits on top and cycles to the next event's compare match below, and what the
+// kind needs. A compare match comes some cycles before what it is for.
+enum event {                        // of the word's high byte
+    EVENT_CYCLES = 0x0F,
     // Service of a slot, one byte: ADMUX of the next slot. Reads the result of the slot before, arms the next.
-    EVENT_SERVICE = 0x0000,
-    EVENT_STORE = 0x1000,           // and keeps the result
-    EVENT_COMPLETE = 0x2000,        // and keeps it: the cycle before is complete
-    EVENT_DARK_STORE = 0x3000,      // after lights are out and all nodes held
-    EVENT_END = 0x4000,             // no event: goes on in the list `list_next`
-    EVENT_WAIT = 0x5000,            // the pause between frames
-    EVENT_RELEASE = 0x8000,         // one byte: DDRC, exactly RELEASE_LEAD_CYCLES after the match
-    EVENT_SET_RELEASE = 0xC000,     // four bytes: PORTC and PORTD at once, lead, DDRC exactly lead after the match
-    EVENT_UNLIT = 0x2000,           // with the last two: of the unlit exposure
+    EVENT_SERVICE = 0x00,
+    EVENT_STORE = 0x10,             // and keeps the result
+    EVENT_COMPLETE = 0x20,          // and keeps it; if lit, the cycle before is complete
+    EVENT_DARK_STORE = 0x30,        // and keeps it, after lights are out and all nodes held
+    EVENT_AGAIN = 0x40,             // no event; one byte: length of the list, which is run again unlit if it was lit
+    EVENT_LAST = 0x50,              // the same, but then `list_next` follows
+    EVENT_WAIT = 0x60,              // the pause between frames
+    EVENT_RELEASE = 0x80,           // one byte: DDRC, exactly RELEASE_LEAD_CYCLES after the match; and a service, or
+    EVENT_ALONE = 0x30,             // none
+    EVENT_SET_RELEASE = 0xC0,       // the same; four bytes: PORTC and PORTD at once, if lit; lead less LEAD_LESS_CYCLES; DDRC exactly lead later
 };
 
 enum sense_cycles {
     SERVICE_AT = 40,                // compare match of a service after its slot's trigger, at the earliest
-    HOLD_AT = SAMPLE_CYCLES - 8,    // of the first event after the unlit, or lit, samples: lights out, nodes held
-    RELEASE_LEAD_CYCLES = 112,      // other interrupts may take 75 of them
-    LIGHT_LEAD_CYCLES = 128,
-    SPACING_CYCLES = 84,            // from a service's match to a release's, so that neither is late
-    AFTER_RELEASE_CYCLES = 24,      // from a release to the next event's match
-    EXPOSURES_APART_CYCLES = 64,    // two releases: this far apart, or one
-    // Of the wait, from the TCNT1 it looks at to the end of OUT, without the wait itself.
+    SERVICE_BEFORE_CYCLES = 500,    // from the first release it follows to the next trigger, at least
+    HOLD_AT = SAMPLE_CYCLES - 40,   // of the first event after a half's samples; it acts 43 cycles later at the earliest
+    RELEASE_LEAD_CYCLES = 104,      // 76 without any other interrupt in the way
+    LIGHT_LEAD_CYCLES = 112,
+    HOLD_CYCLES = 166,              // from the first event's match, a service, to a release's, so that that is not late
+    SPACING_CYCLES = 200,           // the same of the others: the one that completes a cycle takes longer
+    WITH_RELEASE_CYCLES = 20,       // from SERVICE_AT to a release that the service can follow without an interrupt
+    AFTER_RELEASE_CYCLES = 4,       // from a release to the next event's match
+    EXPOSURES_APART_CYCLES = 96,    // two releases: this far apart, or one
+    // Of the wait, from the TCNT1 it looks at to the end of OUT, without the wait itself; and what a list's lead is
+    // stated less, so that it fits into a byte.
     RELEASE_FIXED_CYCLES = 27,
+    LEAD_LESS_CYCLES = 24,
 };
 
 enum plan_limits {
-    PLAN_BYTES = 6 * (3 * 3 + 6 + 3) + 1 + 2,
+    PLAN_BYTES = 3 * (3 * 3 + 6 + 3 + 3),
     GAP_BYTES = 8,
     GAP_WAIT_AT = 6,
-    CODES = 13,                     // of the first GND slot, and of twelve samples
+    CODES = 14,                     // of the first pair's GND slots, and of twelve samples
     ADMUX_GROUND = (1 << REFS1) | (1 << REFS0) | 15,
     ADMUX_SUPPLY = (1 << REFS1) | (1 << REFS0) | 7,
     ADMUX_CHANNEL_0 = (1 << REFS1) | (1 << REFS0),
@@ -54,19 +61,27 @@ struct plan {
     uint8_t *first_mux;             // ADMUX of slot 0
 };
 
-// One cycle as the interrupt leaves it. Codes in the order of slots: of slot 0, then lit a, b, unlit a, b of each
-// pair.
+// One cycle as the interrupt leaves it. Codes in the order of slots: of the first pair GND, lit a, b, GND, unlit a,
+// b; of the others lit a, b, unlit a, b.
 struct taken {
     uint16_t code[CODES];
     uint16_t end;                   // TCNT1 at the trigger after the last slot
     uint8_t wraps;                  // low byte of sense_wraps there
     uint8_t plan;                   // index of the plan that it followed
+    uint8_t turn;                   // sense_turn of the next
     uint8_t left;                   // cycles of its frame still to come
     uint16_t seq;                   // of its frame
     struct taken *other;
-    uint8_t late[2][HAL_CHANNELS];  // lit, unlit
 };
 
+// Releases that came too late, by how many cycles: in the cycle that runs, or the one before.
+struct late {
+    uint8_t cycles[2][HAL_CHANNELS];    // lit, unlit
+    uint8_t any;
+};
+
+extern struct late sense_late[2];
+extern uint8_t sense_turn;                      // the running cycle's: 0 or sizeof(struct late)
 extern struct plan sense_plan[2];
 extern uint8_t sense_gap[GAP_BYTES];                    // the list of a pause: two services and EVENT_WAIT
 extern const uint8_t *volatile sense_list_next; // list that follows the running one
@@ -79,19 +94,19 @@ extern uint16_t sense_seq;
 extern uint8_t sense_drop;                      // there is no cycle before this one: nothing is complete
 extern uint8_t sense_pause;                     // frames end with a pause
 extern volatile uint8_t sense_current;                   // index of the running cycle's plan
+extern uint8_t *sense_first;                    // ADMUX of slot 0 to be set back to GND; NULL: it is
 extern volatile uint8_t sense_done;             // cycles complete, low byte
 
 // Called by the interrupt, seldom. OCR1A is the match it was called at.
 const uint8_t *sense_wait(void);                // the pause goes on or ends; the list to go on with
 const uint8_t *sense_give_up(void);             // a trigger was missed: lights are out, the cycle is lost
-void sense_late(uint8_t channels, uint8_t cycles, uint8_t kind);  // bits of channels; high byte of their event
 
 // plan.c
-uint8_t plan_channel(uint8_t wiring, uint8_t phase, uint8_t second);
-uint16_t plan_exposure_most(uint8_t channel, uint8_t wiring, uint16_t slot_cycles);
+extern const uint8_t plan_place[2][HAL_CHANNELS];        // in flash
+uint8_t plan_channel(uint8_t wiring, uint8_t place);    // of the sensor at a place: 2 * pair, + 1 for its second
 // Limits, and two releases not too near each other.
 void plan_clip(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t wiring, uint16_t slot_cycles);
 // From plan->exposure_cycles, which are clipped, and plan->slot_cycles.
-void plan_write(struct plan *plan, const struct hal_timing *timing);
+void plan_write(struct plan *plan, const struct hal_timing *timing, uint8_t lights);
 
 #endif

@@ -1,23 +1,28 @@
 // SPDX-License-Identifier: Apache-2.0
-// The receiver's ring, and how a byte gets into it: by its interrupt (serial.c), or by one that knows it
-// takes long (sense.c). The receiver itself holds two bytes, 20 us at 1 Mbaud.
+// The rings of the serial line, and how a byte gets into the receiver's: by its interrupt (serial.c), which has
+// to be short. The receiver itself holds two bytes, 20 us at 1 Mbaud.
 #ifndef PORT_SERIAL_H
 #define PORT_SERIAL_H
 
 #include <avr/io.h>
 #include <stdint.h>
 
-enum { RX_RING = 128 };                         // power of two
+enum {
+    RX_RING = 128,                              // power of two
+    TX_RING = 192,                              // a frame of all three streams (116) and an answer (72)
+};
 
 extern uint8_t rx_ring[RX_RING];
 extern volatile uint8_t rx_head;                // written with interrupts off
 extern uint8_t rx_tail;                         // written by the main loop
 extern volatile uint16_t rx_overruns;
+extern uint8_t tx_ring[TX_RING];
+extern volatile uint8_t tx_head;                // written by the main loop
+extern volatile uint8_t tx_tail;                // written with interrupts off
 extern volatile uint16_t zero_ticks;            // TCNT1 when the latest 0x00 arrived
 
 // With interrupts off, and only when a byte has arrived. 27 cycles, 34 for a 0x00. In assembler because the
-// compiler's prologue would cost the interrupt as much again: with bytes back to back both ways the UART's two
-// must leave room for the ADC's, which comes after them.
+// compiler's prologue would cost the interrupt as much again, and a release waits for it.
 static inline __attribute__((always_inline)) void serial_receive(void)
 {
     __asm__ volatile(

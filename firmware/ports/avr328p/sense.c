@@ -3,25 +3,27 @@
 // the pauses between frames. The cycles themselves run in sense_isr.c after the plans of plan.c.
 #include "port_sense.h"
 
+#include <avr/pgmspace.h>
 #include <string.h>
 
+#define SELDOM __attribute__((noinline, cold, optimize("Os")))
+
 enum {
+    NONE = 255,
     WAIT_AT = 120,                  // compare match of EVENT_WAIT after that of the service before it
     PAUSE_LEAST_SLOTS = 3,
-    RESTART_CYCLES = 600,           // before a frame that begins out of turn
+    RESTART_CYCLES = 1500,          // before a frame that begins with another timing
     PAUSE_CHUNK_CYCLES = 0x8000,    // waited for at once
     PAUSE_WHOLE_CYCLES = 0xC000,
     LOCKOUT_WRAPS = LOCKOUT_MS * (F_CPU / 1000) / 65536 + 1,
     HELD_LEAST = 9,                 // code: what is below is an offset of the converter, not a voltage
-    SUPPLY_CYCLES_LOG2 = 10,        // looked at once in so many cycles
-    SUPPLY_FIRST = 16,
-    SUPPLY_TRIES = 8,
+    SUPPLY_EVERY_CYCLES = 1024,
     SUPPLY_CODE_LEAST = 130,        // 4.2 V at a bandgap of 1.2 V,
     SUPPLY_CODE_MOST = 235,         // 5.7 V at 1.0 V: beyond, nothing or something else is on the pin
     SUPPLY_MV_PER_CODE_Q8 = 6875,   // 1.1 V / 1024 / 0.04
 };
 
-static struct taken ring[2] = { { .other = &ring[1] }, { .other = &ring[0] } };
+static struct taken ring[2];
 
 uint8_t sense_gap[GAP_BYTES];
 const uint8_t *volatile sense_list_next;
@@ -33,6 +35,9 @@ uint8_t sense_left, sense_last;
 uint16_t sense_seq;
 uint8_t sense_drop;
 uint8_t sense_pause;
+uint8_t *sense_first;
+struct late sense_late[2];
+uint8_t sense_turn;
 volatile uint8_t sense_current;
 volatile uint8_t sense_done;
 
@@ -47,18 +52,24 @@ static volatile uint16_t late_slots;
 static struct hal_timing timing;            // asked for
 static uint16_t exposure[HAL_CHANNELS];     // asked for, clipped
 static uint16_t slot;                       // of `timing`
+static uint32_t pause_new;
 static uint8_t timing_new, plan_new;        // asked for and not in a plan yet
 static uint8_t locked_out;
 static uint8_t took;                        // cycles taken, low byte
 static uint16_t late_frames;
 static uint32_t frames;
-static uint32_t taken_ticks;
+static uint16_t took_at;                    // TCNT1, and its wraps
+static uint8_t took_wraps;
+static uint8_t shown_plan = NONE;           // what the reading's exposures and these are of
+static uint16_t mean_to_last, mean_to_end;
+static uint8_t late_shown;
 static uint16_t cycles_max;
 static uint16_t cycles;                     // taken, low half
-static uint8_t supply_tries;                // left of this look at the supply
+static volatile uint8_t supply;             // enum supply
+enum supply { SUPPLY_RESTS, SUPPLY_WANTED, SUPPLY_ASKED };
+static uint8_t supply_of;                   // the cycle that has it makes sense_done this
 static uint8_t supply_code, supply_boot;    // 0: unknown
 
-// Call with interrupts off.
 static uint32_t wraps_at(uint16_t ticks)
 {
     return sense_wraps + (ticks < sense_base);
@@ -70,117 +81,152 @@ static void base_at(uint16_t ticks)
     sense_base = ticks;
 }
 
-static uint32_t ticks_now(void)
+uint8_t sense_alive(void)
 {
-    uint32_t high;
+    return sense_done + alive;
+}
+
+static uint16_t ticks_now(void)
+{
     uint16_t ticks;
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
         ticks = TCNT1;
-        high = wraps_at(ticks);
     }
-    return high << 16 | ticks;
+    return ticks;
+}
+
+// TCNT1, and how often it wrapped. Read again if the interrupt went on meanwhile, which is off as little as can be: a
+// release may be waiting.
+static uint32_t now(uint16_t *ticks)
+{
+    uint32_t wraps;
+    uint8_t before;
+    do {
+        before = sense_alive();
+        *ticks = ticks_now();
+        wraps = wraps_at(*ticks);
+    } while (before != sense_alive());
+    return wraps;
 }
 
 uint32_t hal_now_us(void)
 {
-    uint32_t high;
     uint16_t ticks;
-    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
-        ticks = TCNT1;
-        high = wraps_at(ticks);
-    }
-    return high << 12 | ticks >> 4;
+    const uint32_t wraps = now(&ticks);
+    return wraps << 12 | ticks >> 4;
 }
 
 static struct taken *filling(void)
 {
-    return sense_out < ring[1].code ? &ring[0] : &ring[1];
+    const uint16_t *out;
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+        out = sense_out;
+    }
+    return out < ring[1].code ? &ring[0] : &ring[1];
 }
 
-// A frame whose first cycle's hold is at `hold`, by TCNT1.
-static const uint8_t *begin_at(uint16_t hold)
+// Interrupts off. The first GND slot of the cycle that makes sense_done `of` converts the divider at A7 instead; the
+// interrupt sets it back when that is under way.
+static void ask_supply(struct plan *plan, uint8_t of)
 {
-    const struct plan *plan = &sense_plan[plan_next];
+    if (supply != SUPPLY_WANTED)
+        return;
+    supply = SUPPLY_ASKED;
+    supply_of = of;
+    *plan->first_mux = ADMUX_SUPPLY;
+    sense_first = plan->first_mux;
+}
+
+// A frame whose first cycle's hold is at `hold`, by TCNT1. Called with interrupts off.
+SELDOM static const uint8_t *begin_at(uint16_t hold)
+{
+    struct plan *plan = &sense_plan[plan_next];
     pausing = 0;
-    if (restart) {
-        restart = 0;
-        if (sense_left != sense_last)
-            sense_seq++;            // the one under way is cut short
-        sense_last = timing.repeats - 1;
-        sense_left = sense_last;
-        sense_slot = plan->slot_cycles;
-        sense_pause = pause_cycles != 0;
-        const uint16_t second = sense_slot - HOLD_AT + SERVICE_AT;
-        sense_gap[0] = (uint8_t)second;
-        sense_gap[1] = EVENT_DARK_STORE >> 8 | second >> 8;
-        sense_gap[2] = ADMUX_GROUND;
-        sense_gap[3] = WAIT_AT;
-        sense_gap[4] = EVENT_COMPLETE >> 8;
-        sense_gap[5] = ADMUX_GROUND;
-    }
-    // As if another cycle had gone before: a conversion of GND, the next trigger a slot later, nothing of it kept.
-    OCR1B = hold - HOLD_AT;
-    TIFR1 = 1 << OCF1B;
-    ADMUX = ADMUX_GROUND;
-    OCR1A = hold;
+    ask_supply(plan, sense_done + 1);
     sense_drop = 1;
     sense_out = &filling()->code[CODES - 2];
     sense_list_next = sense_pause && sense_left == 0 ? sense_gap : plan->event;
+    // As if another cycle had gone before: a conversion of GND, the next trigger a slot later, nothing of it kept.
+    ADMUX = ADMUX_GROUND;
+    OCR1B = hold - HOLD_AT;
+    OCR1A = hold;
+    TIFR1 = (1 << OCF1A) | (1 << OCF1B);
+    GPIOR2 = 0xFF;
     return plan->event;
 }
 
+// A frame begins out of turn, or with another timing.
+SELDOM static void begin_frame(void)
+{
+    if (sense_left != sense_last)
+        sense_seq++;                // the one under way is cut short
+    if (restart) {
+        restart = 0;
+        sense_last = timing.repeats - 1;
+        sense_slot = sense_plan[plan_next].slot_cycles;
+        sense_pause = pause_cycles != 0;
+        const uint16_t second = sense_slot - HOLD_AT + SERVICE_AT;
+        sense_gap[0] = (uint8_t)second;
+        sense_gap[1] = EVENT_DARK_STORE | second >> 8;
+        sense_gap[2] = ADMUX_GROUND;
+        sense_gap[3] = WAIT_AT;
+        sense_gap[4] = EVENT_COMPLETE;
+        sense_gap[5] = ADMUX_GROUND;
+    }
+    sense_left = sense_last;
+}
+
+// The next event comes long after this: other interrupts may.
 const uint8_t *sense_wait(void)
 {
     const uint16_t match = OCR1A;
     base_at(match);
     alive++;
+    sei();
     if (!pausing) {
         pausing = 1;
         pause_left = pause_cycles - (sense_slot - HOLD_AT + SERVICE_AT + WAIT_AT);
     }
-    if (restart)
+    uint16_t chunk = PAUSE_CHUNK_CYCLES;
+    if (restart) {
+        begin_frame();
         pause_left = RESTART_CYCLES;
-    if (pause_left > PAUSE_WHOLE_CYCLES) {
-        pause_left -= PAUSE_CHUNK_CYCLES;
-        OCR1A = match + PAUSE_CHUNK_CYCLES;
-        return &sense_gap[GAP_WAIT_AT];
     }
-    return begin_at(match + (uint16_t)pause_left);
+    const uint8_t go_on = pause_left > PAUSE_WHOLE_CYCLES;
+    if (go_on)
+        pause_left -= PAUSE_CHUNK_CYCLES;
+    else
+        chunk = (uint16_t)pause_left;
+    cli();
+    if (!go_on)
+        return begin_at(match + chunk);
+    OCR1A = match + chunk;
+    return &sense_gap[GAP_WAIT_AT];
 }
 
 const uint8_t *sense_give_up(void)
 {
-    const uint16_t now = TCNT1;
-    base_at(now);
-    late_slots++;
-    if (sense_left != sense_last) {
-        sense_seq++;
-        sense_left = sense_last;
-    }
-    const uint8_t *list = begin_at(now + RESTART_CYCLES);
+    const uint16_t given_up = TCNT1;
+    base_at(given_up);
+    alive++;
     TIFR1 = 1 << OCF1A;
-    return list;
-}
-
-void sense_late(uint8_t channels, uint8_t cycles, uint8_t kind)
-{
-    const uint8_t unlit = (kind & EVENT_UNLIT >> 8) != 0;
-    struct taken *into = filling();
-    // The first lit releases of a cycle may come before the last codes of the one before.
-    const uint8_t early = sense_out > &into->code[CODES - 3] && !unlit;
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++, channels >>= 1) {
-        if (!(channels & 1))
-            continue;
-        const uint8_t first = i == plan_channel(timing.wiring, 0, 0) || i == plan_channel(timing.wiring, 0, 1);
-        (early && first ? into->other : into)->late[unlit][i] = cycles;
-    }
+    sei();
+    late_slots++;
+    begin_frame();
+    memset(&sense_late[sense_turn != 0], 0, sizeof sense_late[0]);
+    cli();
+    // A whole cycle in the dark: what was lit just now is not lit again before its turn.
+    return begin_at(given_up + SLOTS * sense_slot);
 }
 
 // ------------------------------------------------------------------------------------------------------
 
 uint16_t hal_exposure_most(uint8_t channel)
 {
-    return plan_exposure_most(channel, timing.wiring, slot);
+    uint8_t second = 0;
+    for (uint8_t place = 1; place < HAL_CHANNELS; place += 2)
+        second |= plan_channel(timing.wiring, place) == channel;
+    return (second ? 3 : 2) * slot - EXPOSURE_LESS_CYCLES;
 }
 
 void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS])
@@ -190,59 +236,57 @@ void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS])
     plan_new = 1;
 }
 
-// Cycles per slot that make frames of `frame` cycles without a pause, to the nearest, without a division.
-static uint16_t slot_for(uint32_t frame, uint8_t repeats)
-{
-    const uint16_t step = SLOTS * repeats;
-    uint16_t n = SLOT_CYCLES_MIN;
-    for (uint32_t at = (uint32_t)step * SLOT_CYCLES_MIN + step / 2; at <= frame && n < SLOT_CYCLES_MAX; at += step)
-        n++;
-    return n;
-}
-
-static uint32_t pause_of(const struct hal_timing *t, uint16_t slot_cycles)
-{
-    const uint32_t sensing = (uint32_t)(SLOTS * t->repeats) * slot_cycles;
-    return t->frame_cycles > sensing ? t->frame_cycles - sensing : 0;
-}
-
-void hal_set_timing(struct hal_timing *t)
+SELDOM void hal_set_timing(struct hal_timing *t)
 {
     if (t->repeats < 1)
         t->repeats = 1;
     if (t->repeats > SG_LIGHT_REPEATS_MAX)
         t->repeats = SG_LIGHT_REPEATS_MAX;
-    uint16_t n = slot_for(t->period_cycles, 1);
-    uint32_t pause = pause_of(t, n);
-    if (pause < PAUSE_LEAST_SLOTS * n) {
-        if (t->frame_cycles)
-            n = slot_for(t->frame_cycles, t->repeats);
-        while ((pause = pause_of(t, n)) >= SLOTS * (uint16_t)t->repeats && pause < PAUSE_LEAST_SLOTS * n)
-            n--;                    // cycles cannot be that long: shorter ones, and a pause
-        if (pause < PAUSE_LEAST_SLOTS * n)
-            pause = 0;
+    uint16_t n = SLOT_CYCLES_MIN;
+    for (uint16_t left = t->period_cycles; left >= SLOTS * (SLOT_CYCLES_MIN + 1) && n < SLOT_CYCLES_MAX; left -= SLOTS)
+        n++;
+    const uint16_t step = SLOTS * t->repeats;
+    uint32_t pause = t->frame_cycles;
+    for (uint8_t k = 0; k < t->repeats; k++)
+        pause = pause > SLOTS * n ? pause - SLOTS * n : 0;
+    if (pause < step)
+        pause = 0;
+    // A pause too short to make: shorter cycles, a longer pause.
+    while (pause && pause < PAUSE_LEAST_SLOTS * n) {
+        n--;
+        pause += step;
     }
     t->period_cycles = SLOTS * n;
     if (t->frame_cycles || pause)
         t->frame_cycles = (uint32_t)t->repeats * t->period_cycles + pause;
     timing = *t;
     slot = n;
+    pause_new = pause;
     plan_clip(exposure, t->wiring, n);
     timing_new = 1;
     plan_new = 1;
 }
 
-static void write_plan(uint8_t index)
+SELDOM static void write_plan(uint8_t index)
 {
-    struct hal_timing lit = timing;
     struct plan *plan = &sense_plan[index];
-    if (locked_out)
-        lit.lights = 0;
     memcpy(plan->exposure_cycles, exposure, sizeof exposure);
     plan->slot_cycles = slot;
-    plan_write(plan, &lit);
-    if (supply_tries)
-        *plan->first_mux = ADMUX_SUPPLY;
+    plan_write(plan, &timing, timing.lights && !locked_out);
+    if (shown_plan == index)
+        shown_plan = NONE;
+    plan_new = 0;
+    ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+        plan_next = index;
+        if (timing_new) {
+            timing_new = 0;
+            pause_cycles = pause_new;
+            restart = 1;
+            sense_list_next = sense_gap;
+        } else if (sense_list_next != sense_gap) {
+            sense_list_next = plan->event;
+        }
+    }
 }
 
 void sense_poll(void)
@@ -251,37 +295,32 @@ void sense_poll(void)
         locked_out = 0;
         plan_new = 1;
     }
-    // The other plan is free once a cycle that follows this one is complete up to the last that did not.
-    if (!plan_new || sense_current != plan_next || sense_done != took)
-        return;
-    const uint8_t index = !plan_next;
-    write_plan(index);
-    plan_new = 0;
-    ATOMIC_BLOCK(ATOMIC_FORCEON) {
-        plan_next = index;
-        if (timing_new) {
-            timing_new = 0;
-            pause_cycles = pause_of(&timing, slot);
-            restart = 1;
-            sense_list_next = sense_gap;
-        } else if (sense_list_next != sense_gap) {
-            sense_list_next = sense_plan[index].event;
+    // The other plan is free when neither the running cycle nor the newest complete one follows it.
+    if (plan_new && sense_current == plan_next && filling()->other->plan == plan_next)
+        write_plan(!plan_next);
+    // Its other GND slot must be over, and the same plan go on.
+    if (supply == SUPPLY_WANTED) {
+        ATOMIC_BLOCK(ATOMIC_FORCEON) {
+            struct plan *plan = &sense_plan[plan_next];
+            const uint16_t since = TCNT1 - sense_base;
+            if (sense_current == plan_next && sense_list_next == plan->event && since > 3 * sense_slot
+                && since < (SLOTS - 2) * sense_slot)
+                ask_supply(plan, sense_done + 2);
         }
     }
 }
 
-void sense_start(struct hal_timing *t, uint16_t exposure_cycles[HAL_CHANNELS])
+SELDOM void sense_start(struct hal_timing *t, uint16_t exposure_cycles[HAL_CHANNELS])
 {
     locked_out = (boot_reset_cause() & SG_RESET_WATCHDOG) != 0;
     memcpy(exposure, exposure_cycles, sizeof exposure);
     hal_set_timing(t);
     memcpy(exposure_cycles, exposure, sizeof exposure);
     write_plan(0);
-    plan_new = 0;
-    timing_new = 0;
-    pause_cycles = pause_of(&timing, slot);
-    restart = 1;
-    sense_gap[GAP_WAIT_AT + 1] = EVENT_WAIT >> 8;
+    begin_frame();
+    ring[0].other = &ring[1];
+    ring[1].other = &ring[0];
+    sense_gap[GAP_WAIT_AT + 1] = EVENT_WAIT;
     sense_out = ring[0].code;
 
     PORTC = 0;
@@ -299,90 +338,90 @@ void sense_start(struct hal_timing *t, uint16_t exposure_cycles[HAL_CHANNELS])
     const uint8_t *list = begin_at(4 * slot);       // the converter's first result takes 25 of its clocks
     OCR0A = (uint8_t)(uint16_t)list;
     OCR0B = (uint16_t)list >> 8;
-    TIFR1 = 1 << OCF1A;
     TIMSK1 = 1 << OCIE1A;
     TCCR1B = 1 << CS10;
 }
 
 // ------------------------------------------------------------------------------------------------------
 
-static void convert_first(uint8_t admux)
+static void look_at_supply(uint8_t done, uint16_t held_code)
 {
-    for (uint8_t i = 0; i < 2; i++)
-        if (sense_plan[i].first_mux)
-            *sense_plan[i].first_mux = admux;
+    if ((++cycles & (SUPPLY_EVERY_CYCLES - 1)) == 0)
+        supply = SUPPLY_WANTED;
+    if (supply != SUPPLY_ASKED || done != supply_of)
+        return;
+    supply = SUPPLY_RESTS;
+    supply_code = 0;
+    if (held_code >= SUPPLY_CODE_LEAST && held_code <= SUPPLY_CODE_MOST)
+        supply_code = (uint8_t)held_code;
+    if (!supply_boot)
+        supply_boot = supply_code;
 }
 
-// Once a second the first GND slot converts the divider at A7 instead, until a code of it has come or too many have
-// not.
-static void look_at_supply(uint16_t held_code)
+// What follows from the plan, once for each.
+SELDOM static void show_plan(struct sg_reading *reading, uint8_t index)
 {
-    if ((++cycles & ((1 << SUPPLY_CYCLES_LOG2) - 1)) == SUPPLY_FIRST) {
-        supply_tries = SUPPLY_TRIES;
-        convert_first(ADMUX_SUPPLY);
-    } else if (supply_tries) {
-        if (held_code == 0 && --supply_tries)
-            return;
-        supply_tries = 0;
-        convert_first(ADMUX_GROUND);
-        supply_code = 0;
-        if (held_code >= SUPPLY_CODE_LEAST && held_code <= SUPPLY_CODE_MOST)
-            supply_code = (uint8_t)held_code;
-        if (!supply_boot)
-            supply_boot = supply_code;
-    }
+    const struct plan *plan = &sense_plan[index];
+    uint16_t sum = 0;
+    memcpy(reading->exposure_cycles, plan->exposure_cycles, sizeof plan->exposure_cycles);
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+        sum += plan->exposure_cycles[i];
+    // Mean of the mid-exposures: lit are slots 1, 2, 7, 8, 13 and 14, 7.5 on average; sum / 12 as sum * 5461 / 2^16.
+    sum = (uint16_t)((uint32_t)sum * 5461U >> 16);
+    const uint16_t n = plan->slot_cycles;
+    mean_to_last = 9 * n + (n >> 1) + sum;
+    mean_to_end = mean_to_last + n - SAMPLE_CYCLES;
+    shown_plan = index;
 }
 
-uint8_t sense_alive(void)
+SELDOM static void show_late(struct sg_reading *reading, struct late *late)
 {
-    return sense_done + alive;
+    late_shown = late->any;
+    memcpy(reading->late_lit_cycles, late->cycles, sizeof late->cycles);
+    memset(late, 0, sizeof *late);
 }
 
 uint8_t sense_take(struct hal_cycle *cycle)
 {
-    struct taken *from;
+    struct sg_reading *reading = &cycle->reading;
+    const struct taken *from;
     uint8_t done;
     uint32_t wraps;
-    uint16_t half_sum = 0;
-    ATOMIC_BLOCK(ATOMIC_FORCEON) {
-        done = sense_done;
-        from = filling()->other;
-        wraps = sense_wraps;
-    }
-    if (done == took)
+    if (sense_done == took)
         return 0;
     HAL_BEGIN(HAL_SECTION_FRAME);
-    taken_ticks = ticks_now();
+    do {
+        done = sense_done;
+        from = filling()->other;
+        took_wraps = (uint8_t)now(&took_at);
+        wraps = sense_wraps;
+    } while (done != sense_done);
     late_frames += (uint8_t)(done - took - 1);
     took = done;
 
     // Read without a lock: the interrupt comes back to this one when the other is complete.
-    const struct plan *plan = &sense_plan[from->plan];
-    struct sg_reading *reading = &cycle->reading;
+    if (from->plan != shown_plan)
+        show_plan(reading, from->plan);
+    struct late *late = &sense_late[from->turn == 0];
+    if (late->any || late_shown)
+        show_late(reading, late);
+    const uint8_t *place = timing.wiring == SG_WIRING_LEDS ? plan_place[0] : plan_place[1];
     const uint16_t *code = &from->code[1];
-    for (uint8_t phase = 0; phase < 3; phase++, code += 4)
-        for (uint8_t k = 0; k < 2; k++) {
-            const uint8_t i = plan_channel(timing.wiring, phase, k);
-            reading->lit_code[i] = code[k];
-            reading->unlit_code[i] = code[2 + k];
-        }
-    memcpy(reading->exposure_cycles, plan->exposure_cycles, sizeof reading->exposure_cycles);
-    memcpy(reading->late_lit_cycles, from->late[0], sizeof from->late[0]);
-    memcpy(reading->late_unlit_cycles, from->late[1], sizeof from->late[1]);
-    memset(from->late, 0, sizeof from->late);
+    for (uint8_t phase = 0; phase < 3; phase++) {
+        const uint8_t a = pgm_read_byte(place++), b = pgm_read_byte(place++);
+        reading->lit_code[a] = *code++;
+        reading->lit_code[b] = *code++;
+        code += phase == 0;
+        reading->unlit_code[a] = *code++;
+        reading->unlit_code[b] = *code++;
+    }
     reading->held_code = from->code[0] < HELD_LEAST ? 0 : from->code[0];
-    look_at_supply(reading->held_code);
+    look_at_supply(done, reading->held_code);
 
-    // Mean of the mid-exposures: slots 1, 2, 7, 8, 13, 14 are 7.5 on average; sum / 12 as sum * 5461 / 2^16.
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        half_sum += plan->exposure_cycles[i];
-    half_sum = (uint16_t)((uint32_t)half_sum * 5461U >> 16);
-    const uint16_t n = plan->slot_cycles;
-    const uint16_t from_end = (uint16_t)(10 * n + (n >> 1)) - SAMPLE_CYCLES + half_sum;
     wraps -= (uint8_t)((uint8_t)wraps - from->wraps);
-    const uint32_t end_us = wraps << 12 | from->end >> 4;
-    cycle->t_us = end_us - ((from_end - (from->end & 15U) + 8U) >> 4);
-    cycle->span_us = (uint16_t)(9 * n + (n >> 1) + half_sum + 8U) >> 4;
+    const uint16_t low = from->end & 15;
+    cycle->t_us = (wraps << 12 | from->end >> 4) - ((uint16_t)(mean_to_end - low + 8) >> 4);
+    cycle->span_us = (uint16_t)(mean_to_last + 8) >> 4;
     cycle->seq = from->seq;
     cycle->left = from->left;
     frames += (uint16_t)(from->seq - (uint16_t)frames);
@@ -391,9 +430,12 @@ uint8_t sense_take(struct hal_cycle *cycle)
 
 void sense_taken(void)
 {
-    const uint32_t spent = ticks_now() - taken_ticks;
-    if (spent > cycles_max)
-        cycles_max = spent > UINT16_MAX ? UINT16_MAX : (uint16_t)spent;
+    uint16_t spent;
+    uint8_t wraps = (uint8_t)now(&spent);
+    wraps -= took_wraps + (spent < took_at);
+    spent = wraps ? UINT16_MAX : spent - took_at;
+    if (cycles_max < spent)
+        cycles_max = spent;
     late_frames += sense_done != took;
     HAL_END(HAL_SECTION_FRAME);
 }

@@ -2,18 +2,20 @@
 // The sensing interrupt: serves the events of a plan one after the other (port_sense.h).
 //
 // In assembler for its cycles: some 25 events in 15984 of them. Where the list stands is kept in OCR0A and OCR0B,
-// which one instruction reads or writes; nothing else uses Timer0. An event that is due when the one before ends
+// whether it runs lit in GPIOR2 (0xFF; 0: unlit): one instruction reads or writes these, and nothing else uses
+// Timer0. An event that is due when the one before ends
 // is served at once; else OCR1A brings the interrupt. r26 and r27 hold an event's word, Z the list, then others.
 #include "port_sense.h"
+#include "port_serial.h"
 
 #include <stddef.h>
 
-enum { WAIT_LEAST = 4 };
+enum { WAIT_LEAST = 4, SOON_CYCLES = 48 };
 
-#define CALL_C(function, arguments)                                                                         \
+#define CALL_C(function)                                                                                    \
     "push r0" "\n\t" "push r1" "\n\t" "push r18" "\n\t" "push r19" "\n\t"                                       \
     "push r20" "\n\t" "push r21" "\n\t" "push r22" "\n\t" "push r23" "\n\t" "clr r1" "\n\t"                     \
-    arguments "call " function "\n\t"                                                                         \
+    "call " function "\n\t"                                                                         \
     "pop r23" "\n\t" "pop r22" "\n\t" "pop r21" "\n\t" "pop r20" "\n\t"                                         \
     "pop r19" "\n\t" "pop r18" "\n\t" "pop r1" "\n\t" "pop r0" "\n\t"
 
@@ -75,6 +77,8 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "sbrc r27, 5" "\n\t"
         "sbrc r27, 4" "\n\t"
         "rjmp 1f" "\n\t"
+        "in r24, %[lit]" "\n\t"
+        "sbrc r24, 0" "\n\t"
         "rjmp sense_complete" "\n"
         "1:" "\t" "sts %[out], r30" "\n\t"
         "sts %[out]+1, r31" "\n"
@@ -101,9 +105,37 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "lds r27, %[now]+1" "\n\t"
         "sub r24, r26" "\n\t"
         "sbc r25, r27" "\n\t"
+        "cpi r25, 0" "\n\t"
+        "brne 3f" "\n\t"
+        "cpi r24, %[soon]" "\n\t"
+        "brlo sense_soon" "\n\t"
+        "rjmp sense_exit" "\n"
+        "3:" "\t"
         "cpi r25, %[cycles] + 1" "\n\t"
         "brsh sense_due" "\n"
         "sense_exit:" "\t"
+        "lds r24, %[state]" "\n\t"
+        "sbrc r24, %[came]" "\n\t"
+        "rjmp sense_receive" "\n\t"
+        "sbrs r24, %[room]" "\n\t"
+        "rjmp 5f" "\n\t"
+        "lds r30, %[tail]" "\n\t"
+        "lds r24, %[head]" "\n\t"
+        "cp r30, r24" "\n\t"
+        "breq 5f" "\n\t"
+        "mov r24, r30" "\n\t"
+        "ldi r31, 0" "\n\t"
+        "subi r30, lo8(-(%[ring]))" "\n\t"
+        "sbci r31, hi8(-(%[ring]))" "\n\t"
+        "ld r25, Z" "\n\t"
+        "sts %[data], r25" "\n\t"
+        "inc r24" "\n\t"
+        "cpi r24, %[size]" "\n\t"
+        "brne 4f" "\n\t"
+        "ldi r24, 0" "\n"
+        "4:" "\t" "sts %[tail], r24" "\n\t"
+        "rjmp sense_exit" "\n"
+        "5:" "\t"
         "ldi r24, %[end]" "\n\t"
         "out %[mark], r24" "\n\t"
         "pop r27" "\n\t"
@@ -116,28 +148,41 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "pop r30" "\n\t"
         "reti" "\n"
         "sense_due:" "\t"
-        "cpi r25, 0xFF" "\n\t"
-        "breq 2f" "\n\t"
+        "inc r25" "\n\t"
+        "breq 6f" "\n\t"
         "rjmp sense_missed" "\n"               // 256 cycles ago and more
-        "2:" "\t"
+        "sense_soon:" "\t"                      // too soon to return first
+        "sbis %[flags], %[due]" "\n\t"
+        "rjmp sense_soon" "\n"
+        "6:" "\t"
         "ldi r24, 1 << %[due]" "\n\t"
         "out %[flags], r24" "\n\t"
         "rjmp sense_next" "\n\t"
-        : : [keep] "M"((EVENT_STORE | EVENT_COMPLETE) >> 8), [out] "i"(&sense_out), [adc] "i"(_SFR_MEM_ADDR(ADCL)),
+        : : [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [soon] "M"(SOON_CYCLES), [keep] "M"(EVENT_STORE | EVENT_COMPLETE), [out] "i"(&sense_out), [adc] "i"(_SFR_MEM_ADDR(ADCL)),
           [trigger] "i"(_SFR_MEM_ADDR(OCR1BL)), [slot] "i"(&sense_slot), [matched] "I"(OCF1B), [due] "I"(OCF1A),
-          [flags] "I"(_SFR_IO_ADDR(TIFR1)), [match] "i"(_SFR_MEM_ADDR(OCR1AL)), [cycles] "M"(EVENT_CYCLES >> 8),
-          [now] "i"(_SFR_MEM_ADDR(TCNT1L)), [end] "M"(2 * HAL_SECTION_SENSE + 2),
+          [flags] "I"(_SFR_IO_ADDR(TIFR1)), [match] "i"(_SFR_MEM_ADDR(OCR1AL)), [cycles] "M"(EVENT_CYCLES),
+          [now] "i"(_SFR_MEM_ADDR(TCNT1L)), [tail] "i"(&tx_tail), [head] "i"(&tx_head), [ring] "i"(tx_ring),
+          [size] "M"(TX_RING), [state] "i"(_SFR_MEM_ADDR(UCSR0A)), [room] "I"(UDRE0), [came] "I"(RXC0),
+          [data] "i"(_SFR_MEM_ADDR(UDR0)), [end] "M"(2 * HAL_SECTION_SENSE + 2),
           [mark] "I"(_SFR_IO_ADDR(GPIOR0)));
     __asm__ volatile(
         "sense_release:" "\t"
         "sbrs r27, 6" "\n\t"
         "rjmp 1f" "\n\t"
         "ld r24, Z+" "\n\t"
+        "in r25, %[lit]" "\n\t"
+        "and r24, r25" "\n\t"
         "out %[portc], r24" "\n\t"
         "ldi r24, %[all]" "\n\t"
         "out %[ddrc], r24" "\n\t"
         "ld r24, Z+" "\n\t"
-        "out %[portd], r24" "\n\t"
+        "and r24, r25" "\n\t"
+        "ori r24, %[dark]" "\n\t"
+        "out %[portd], r24" "\n"
+        "sense_wait_lit:" "\t"
+        "lds r24, %[state]" "\n\t"
+        "sbrc r24, %[came]" "\n\t"
+        "rjmp sense_receive_first" "\n\t"
         "ld r25, Z+" "\n\t"
         "rjmp 2f" "\n"
         "1:" "\t" "ldi r25, %[lead]" "\n"
@@ -171,8 +216,16 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "3:" "\t" "nop" "\n\t"
         "dec r25" "\n\t"
         "brne 3b" "\n\t"
-        "out %[ddrc], r24" "\n\t"
-        "rjmp sense_then" "\n"
+        "out %[ddrc], r24" "\n"
+        "sense_released:" "\t"
+        "mov r24, r27" "\n\t"
+        "andi r24, %[alone]" "\n\t"
+        "cpi r24, %[alone]" "\n\t"
+        "breq 5f" "\n\t"
+        "in r30, %[list_low]" "\n\t"
+        "in r31, %[list_high]" "\n\t"
+        "rjmp sense_service" "\n"
+        "5:" "\t" "rjmp sense_then" "\n"
         // Too late to wait: at once, and by how much goes into the reading.
         "sense_near:" "\t" "subi r25, %[fixed]" "\n\t"
         "nop" "\n"
@@ -193,16 +246,37 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "out %[ddrc], r24" "\n\t"
         "ldi r25, 255" "\n"
         "4:" "\t"
-        "push r26" "\n\t"
-        "push r27" "\n\t"
-        CALL_C("%x[late]", "com r24" "\n\t" "and r24, r31" "\n\t" "mov r22, r25" "\n\t" "mov r20, r27" "\n\t")
-        "pop r27" "\n\t"
-        "pop r26" "\n\t"
-        "rjmp sense_then" "\n\t"
+        "push r28" "\n\t"
+        "com r24" "\n\t"                       // what was let go just now
+        "and r24, r31" "\n\t"
+        "lds r28, %[turn]" "\n\t"
+        "ldi r30, lo8(%[log])" "\n\t"
+        "ldi r31, hi8(%[log])" "\n\t"
+        "add r30, r28" "\n\t"
+        "brcc 5f" "\n\t"
+        "inc r31" "\n"
+        "5:" "\t"
+        "ldi r28, 1" "\n\t"
+        "std Z+%[any], r28" "\n\t"
+        "in r28, %[lit]" "\n\t"
+        "sbrs r28, 0" "\n\t"
+        "rjmp 7f" "\n"
+        "5:" "\t" "lsr r24" "\n\t"
+        "brcc 6f" "\n\t"
+        "st Z, r25" "\n"
+        "6:" "\t" "adiw r30, 1" "\n\t"
+        "cpi r24, 0" "\n\t"
+        "brne 5b" "\n\t"
+        "pop r28" "\n\t"
+        "rjmp sense_released" "\n"
+        "7:" "\t" "adiw r30, %[channels]" "\n\t"
+        "rjmp 5b" "\n\t"
         : : [portc] "I"(_SFR_IO_ADDR(PORTC)), [ddrc] "I"(_SFR_IO_ADDR(DDRC)), [portd] "I"(_SFR_IO_ADDR(PORTD)),
-          [all] "M"(PORTC_ALL), [lead] "M"(RELEASE_LEAD_CYCLES), [list_low] "I"(_SFR_IO_ADDR(OCR0A)),
+          [all] "M"(PORTC_ALL), [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [dark] "M"(PORTD_DARK), [lead] "M"(RELEASE_LEAD_CYCLES - LEAD_LESS_CYCLES), [list_low] "I"(_SFR_IO_ADDR(OCR0A)),
           [list_high] "I"(_SFR_IO_ADDR(OCR0B)), [now] "i"(_SFR_MEM_ADDR(TCNT1L)),
-          [match] "i"(_SFR_MEM_ADDR(OCR1AL)), [fixed] "M"(RELEASE_FIXED_CYCLES), [least] "M"(WAIT_LEAST), [late] "i"(sense_late));
+          [match] "i"(_SFR_MEM_ADDR(OCR1AL)), [fixed] "M"(RELEASE_FIXED_CYCLES - LEAD_LESS_CYCLES), [least] "M"(WAIT_LEAST), [log] "i"(sense_late), [turn] "i"(&sense_turn),
+          [any] "I"(offsetof(struct late, any)), [channels] "I"(HAL_CHANNELS),
+          [state] "i"(_SFR_MEM_ADDR(UCSR0A)), [came] "I"(RXC0), [alone] "M"(EVENT_ALONE));
     __asm__ volatile(
         "sense_complete:" "\t"                  // Z behind the last code, r24 and r25 free
         "push r28" "\n\t"
@@ -243,9 +317,12 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "brne sense_dropped" "\n\t"
         "st Z+, r28" "\n\t"                    // wraps
         "st Z+, r25" "\n\t"                    // plan
+        "lds r24, %[turn]" "\n\t"
+        "st Z+, r24" "\n\t"
         : : [trigger] "i"(_SFR_MEM_ADDR(OCR1BL)), [base] "i"(&sense_base), [wraps] "i"(&sense_wraps),
           [current] "i"(&sense_current), [list_low] "I"(_SFR_IO_ADDR(OCR0A)), [list_high] "I"(_SFR_IO_ADDR(OCR0B)),
-          [plan] "i"(sense_plan), [plan_bytes] "i"(sizeof(struct plan)), [drop] "i"(&sense_drop));
+          [plan] "i"(sense_plan), [plan_bytes] "i"(sizeof(struct plan)), [drop] "i"(&sense_drop),
+          [turn] "i"(&sense_turn));
     __asm__ volatile(
         "lds r24, %[seq]" "\n\t"
         "lds r25, %[seq]+1" "\n\t"
@@ -279,6 +356,15 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "sts %[done], r24" "\n\t"
         "ldi r24, 2" "\n\t"
         "out %[moment], r24" "\n\t"
+        "lds r31, %[first]+1" "\n\t"
+        "cpi r31, 0" "\n\t"                   // RAM begins at 0x100
+        "breq 3f" "\n\t"
+        "lds r30, %[first]" "\n\t"
+        "ldi r24, 0" "\n\t"
+        "sts %[first]+1, r24" "\n\t"
+        "ldi r24, %[ground]" "\n\t"
+        "st Z, r24" "\n"
+        "3:" "\t"
         "pop r28" "\n\t"
         "rjmp sense_arm" "\n"
         "sense_dropped:" "\t"
@@ -291,12 +377,29 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "rjmp sense_arm" "\n\t"
         : : [seq] "i"(&sense_seq), [left] "i"(&sense_left), [last] "i"(&sense_last), [pause] "i"(&sense_pause),
           [gap] "i"(sense_gap), [list_next] "i"(&sense_list_next), [out] "i"(&sense_out), [done] "i"(&sense_done),
-          [moment] "I"(_SFR_IO_ADDR(GPIOR1)), [drop] "i"(&sense_drop),
+          [moment] "I"(_SFR_IO_ADDR(GPIOR1)), [first] "i"(&sense_first), [ground] "M"(ADMUX_GROUND), [drop] "i"(&sense_drop),
           [back] "M"(offsetof(struct taken, wraps)));
     __asm__ volatile(
         "sense_special:" "\t"
-        "sbrc r27, 4" "\n\t"
+        "sbrc r27, 5" "\n\t"
         "rjmp sense_pausing" "\n\t"
+        "in r24, %[lit]" "\n\t"
+        "com r24" "\n\t"
+        "out %[lit], r24" "\n\t"
+        "breq 1f" "\n\t"
+        "sbrc r27, 4" "\n\t"
+        "rjmp 2f" "\n\t"
+        "adiw r30, 1" "\n\t"
+        "rjmp sense_event" "\n"
+        "1:" "\t" "ld r24, Z" "\n\t"
+        "sub r30, r24" "\n\t"
+        "sbci r31, 0" "\n\t"
+        "rjmp sense_event" "\n"
+        "2:" "\t"
+        "ldi r24, %[turns]" "\n\t"
+        "lds r25, %[turn]" "\n\t"
+        "sub r24, r25" "\n\t"
+        "sts %[turn], r24" "\n\t"
         "lds r30, %[list_next]" "\n\t"
         "lds r31, %[list_next]+1" "\n\t"
         "ldi r24, 1" "\n\t"
@@ -309,10 +412,10 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "out %[portd], r24" "\n\t"
         "ldi r24, %[all]" "\n\t"
         "out %[ddrc], r24" "\n\t"
-        CALL_C("%x[give_up]", "")
+        CALL_C("%x[give_up]")
         "rjmp sense_list" "\n"
         "sense_pausing:" "\t"
-        CALL_C("%x[wait]", "") "\n"
+        CALL_C("%x[wait]") "\n"
         "sense_list:" "\t"
         "out %[list_low], r24" "\n\t"
         "out %[list_high], r25" "\n\t"
@@ -320,5 +423,16 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         : : [list_next] "i"(&sense_list_next), [moment] "I"(_SFR_IO_ADDR(GPIOR1)),
           [portc] "I"(_SFR_IO_ADDR(PORTC)), [portd] "I"(_SFR_IO_ADDR(PORTD)), [dark] "M"(PORTD_DARK),
           [ddrc] "I"(_SFR_IO_ADDR(DDRC)), [all] "M"(PORTC_ALL), [give_up] "i"(sense_give_up),
-          [wait] "i"(sense_wait), [list_low] "I"(_SFR_IO_ADDR(OCR0A)), [list_high] "I"(_SFR_IO_ADDR(OCR0B)));
+          [wait] "i"(sense_wait), [turn] "i"(&sense_turn), [turns] "M"(sizeof(struct late)), [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [list_low] "I"(_SFR_IO_ADDR(OCR0A)), [list_high] "I"(_SFR_IO_ADDR(OCR0B)));
+    // The receiver holds no more than comes while a release is waited for.
+    __asm__ volatile("sense_receive_first:" "\t"
+                     "push r30" "\n\t"
+                     "push r31" "\n\t");
+    serial_receive();
+    __asm__ volatile("pop r31" "\n\t"
+                     "pop r30" "\n\t"
+                     "rjmp sense_wait_lit" "\n"
+                     "sense_receive:" "\t");
+    serial_receive();
+    __asm__ volatile("rjmp sense_exit" "\n\t");
 }
