@@ -42,9 +42,10 @@ def test_by_default_frames_come_as_fast_as_can_be(board):
 def test_the_rate_asked_for_is_the_rate_of_the_frames(board, rate_hz):
     _, device = board(models={0: random_model(20).image})
     now = device.settings(rate_hz=rate_hz)
-    assert now.rate_hz == rate_hz and now.rate_limit_hz == 1001
-    assert now.frame_period_us == pytest.approx(1e6 / rate_hz, abs=1)
-    assert 999 <= now.period_us <= 1999
+    # A timer cycle more or less in each of 18 slots is what there is to choose from.
+    assert now.rate_hz == pytest.approx(rate_hz, rel=2e-3) and now.rate_limit_hz == 1001
+    assert now.frame_period_us == pytest.approx(1e6 / rate_hz, rel=2e-3)
+    assert 999 <= now.period_us <= 1998
     device.set_stream(gaze=True)
     frames = collect(device, max(20, rate_hz // 4))[10:]
     assert hertz_of(frames) == pytest.approx(rate_hz, rel=2e-3)
@@ -56,10 +57,10 @@ def test_the_rate_asked_for_is_the_rate_of_the_frames(board, rate_hz):
 def test_a_frame_of_several_cycles_takes_as_long_as_they_do(board, repeats):
     _, device = board(models={0: random_model(20).image})
     now = device.settings(repeats=repeats)
-    assert now.rate_hz == now.rate_limit_hz == CPU_HZ // (repeats * 16 * now.period_us) or now.rate_hz
+    assert now.rate_hz == now.rate_limit_hz and now.period_us == 999
     assert now.frame_period_us == pytest.approx(repeats * now.period_us, abs=repeats)
     device.set_stream(raw=True, gaze=True)
-    frames = collect(device, 60)
+    frames = collect(device, 60)[20:]
     assert hertz_of(frames) == pytest.approx(now.rate_hz, rel=0.01)
     # From the mean of all samples to the last one: half a frame, about.
     assert frames[-1].raw.span_us == pytest.approx(now.frame_period_us / 2, rel=0.2)
@@ -69,13 +70,13 @@ def test_a_frame_of_several_cycles_takes_as_long_as_they_do(board, repeats):
 def test_a_longer_period_is_exposed_longer_unless_power_is_low(board):
     _, device = board()
     normal = device.settings(rate_hz=250)
-    assert normal.period_us == 1999 and normal.frame_period_us == 4000
+    assert normal.period_us == 1998 and normal.frame_period_us == 4000
     assert device.exposure(us=[1000] * 6).exposure_us[1] > 200
     low = device.settings(power="low")
     assert low.period_us == 999 and low.frame_period_us == 4000 and low.power == lib.SG_POWER_LOW
     assert max(device.exposure().exposure_us) < 160
     device.set_stream(raw=True)
-    assert hertz_of(collect(device, 50)) == pytest.approx(250, rel=2e-3)
+    assert hertz_of(collect(device, 50)[20:]) == pytest.approx(250, rel=2e-3)
     calm(device)
 
 
@@ -111,8 +112,8 @@ def test_a_rate_beyond_the_limit_is_the_limit(board):
     device.set_stream(gaze=True)
     now = device.settings(rate_hz=1000)
     assert 300 < now.rate_limit_hz < 450 and now.rate_hz == now.rate_limit_hz
-    assert now.period_us == pytest.approx(1999, abs=1)
-    assert hertz_of(collect(device, 100)) == pytest.approx(now.rate_hz, rel=0.01)
+    assert now.period_us == pytest.approx(1998, abs=1)
+    assert hertz_of(collect(device, 100)[20:]) == pytest.approx(now.rate_hz, rel=0.01)
     calm(device)
 
 
