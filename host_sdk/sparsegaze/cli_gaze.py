@@ -126,7 +126,7 @@ def calibrate(port, n_targets, vectors, n_validation, seed, save, distance_mm, w
 
     Look at each dot until it moves; blink while it moves. A simulated person does so by itself. Targets cover
     +-22 deg (or what the screen allows). The recording is kept whatever happens later, so nothing has to be
-    looked at twice.
+    looked at twice. A new board does well to be measured itself first: `sparsegaze linearity PORT`.
 
     \b
     Example:

@@ -208,9 +208,10 @@ def evaluate(done, model, true_deg=None):
     if model is not None:
         same &= frames["model_crc"] == model.crc
     changes = int(np.sum((frames["raw_flags"] & lib.SG_FLAG_EXPOSURE) != 0))
-    return Validation(
-        done, settled, counted, error, model, int(have.sum()), int(np.sum(have & ~same)), true_deg, changes
-    )
+    faulty = int(np.sum((frames["raw_flags"][settled] & lib.SG_FLAG_FAULT) != 0))
+    notes = [f"{faulty} settled frames had a fault: `sparsegaze status` names it"] if faulty else []
+    compared, differing = int(have.sum()), int(np.sum(have & ~same))
+    return Validation(done, settled, counted, error, model, compared, differing, true_deg, changes, notes)
 
 
 def read_truth(path, virtual_us):

@@ -165,6 +165,13 @@ def test_doctor_of_a_port_with_nothing_behind_it_is_a_finding_not_a_crash(comman
     assert code == 1 and "FAULT" in out and "no such port" in out and err == ""
 
 
+def test_a_validation_with_faults_says_so_and_counts_them_as_loss(command_json, fake):
+    fake(linear_model(), raw_flags=lambda t_us: lib.SG_FLAG_FAULT if t_us > 5_000_000 else 0)
+    code, data, err = command_json("validate", "PORT", "--targets", "4")
+    assert code == 0 and data["accuracy"]["data_loss_percent"] > 20
+    assert "settled frames had a fault" in " ".join(data["notes"]) and "sparsegaze status" in err
+
+
 def test_a_stream_of_faulty_frames_says_so(command, fake):
     fake(linear_model(), raw_flags=lambda t_us: lib.SG_FLAG_FAULT)
     code, out, _ = command("stream", "PORT", "--seconds", "1")
