@@ -157,7 +157,10 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "6:" "\t"
         "ldi r24, 1 << %[due]" "\n\t"
         "out %[flags], r24" "\n\t"
+        "lds r24, %[state]" "\n\t"
+        "sbrs r24, %[came]" "\n\t"
         "rjmp sense_next" "\n\t"
+        "rjmp sense_receive_next" "\n\t"
         : : [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [soon] "M"(SOON_CYCLES), [keep] "M"(EVENT_STORE | EVENT_COMPLETE), [out] "i"(&sense_out), [adc] "i"(_SFR_MEM_ADDR(ADCL)),
           [trigger] "i"(_SFR_MEM_ADDR(OCR1BL)), [slot] "i"(&sense_slot), [matched] "I"(OCF1B), [due] "I"(OCF1A),
           [flags] "I"(_SFR_IO_ADDR(TIFR1)), [match] "i"(_SFR_MEM_ADDR(OCR1AL)), [cycles] "M"(EVENT_CYCLES),
@@ -434,5 +437,8 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
                      "rjmp sense_wait_lit" "\n"
                      "sense_receive:" "\t");
     serial_receive();
-    __asm__ volatile("rjmp sense_exit" "\n\t");
+    __asm__ volatile("rjmp sense_exit" "\n"
+                     "sense_receive_next:" "\t");
+    serial_receive();
+    __asm__ volatile("rjmp sense_next" "\n\t");
 }
