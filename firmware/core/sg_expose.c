@@ -3,8 +3,7 @@
 
 enum {
     CHANNELS = 6,
-    GOAL_Q2 = SG_EXPOSE_GOAL_CODES / 4,     // codes / 4
-    BRIGHT_Q2 = SG_EXPOSE_BRIGHT_CODE / 4,
+    BRIGHT_Q2 = SG_EXPOSE_BRIGHT_CODE >> 2, // codes / 4
     RISEN_Q2 = 12,              // less than that fits above the goal
     FREED_Q2 = 58,              // a quarter of the range: worth a longer exposure
     WORTH_Q2 = 160,             // a load below it is
@@ -12,6 +11,8 @@ enum {
     FALL_LEAST_Q2 = 8,          // of a peak, below which a fall says nothing
     CAUTION_MOST = 6,
     ACQUIRED_A_CYCLE = 2,
+    SOON_LOOKS = 32,            // 0.2 s
+    WATCH_LOOKS = 5,            // 30 ms: five phases of a period of 10 ms
     SLOW_ROUNDS = 170,          // 1 s at 6 ms a round
 };
 
@@ -73,6 +74,7 @@ static uint8_t change(struct sg_expose_led *led, uint16_t exposure_cycles, uint8
 {
     led->stage = stage;
     led->streak = 0;
+    led->age = 0;
     if (exposure_cycles == led->exposure_cycles)
         return 0;
     led->exposure_cycles = exposure_cycles;
@@ -87,9 +89,12 @@ static uint8_t full(struct sg_expose_led *led, uint16_t unlit, uint16_t then_cyc
     const uint16_t now = clipped(then_cycles >> shift, led->most_cycles);
     if (now >= led->exposure_cycles)
         return 0;
-    if (led->stage == SG_EXPOSE_TRACK && led->caution < CAUTION_MOST)
+    if (led->stage == SG_EXPOSE_ACQUIRE || led->age >= SOON_LOOKS)
+        return change(led, now, SG_EXPOSE_ACQUIRE);
+    const uint8_t again = led->caution != 0;
+    if (led->caution < CAUTION_MOST)
         led->caution++;
-    return change(led, now, SG_EXPOSE_ACQUIRE);
+    return change(led, now, again ? SG_EXPOSE_WATCH : SG_EXPOSE_ACQUIRE);
 }
 
 // A sample that decides at once. Returns 1 if the exposure changed.
@@ -112,6 +117,13 @@ static uint8_t look(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
         led->unlit_peak = unlit_q2;
     else
         led->unlit_peak = (uint8_t)(led->unlit_peak - ((uint8_t)(led->unlit_peak - unlit_q2 + 15U) >> 4));
+    if (led->age != UINT8_MAX)
+        led->age++;
+    if (led->stage == SG_EXPOSE_WATCH) {
+        if (++led->streak < WATCH_LOOKS)
+            return 0;
+        return change(led, wanted(led, (uint16_t)(led->unlit_peak << 2), (uint16_t)(signal_q2 << 2)), SG_EXPOSE_VERIFY);
+    }
     if (led->stage == SG_EXPOSE_VERIFY) {
         led->unlit_then = led->unlit_peak;
         led->signal_then = signal_q2;

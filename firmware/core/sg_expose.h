@@ -38,6 +38,7 @@ struct sg_expose_led {
     uint8_t stage;              // enum sg_expose_stage
     int8_t streak;              // looks in a row that were too bright (> 0) or too dim (< 0)
     uint8_t caution;            // eighths taken off the goal since exposures chosen of late were full soon after
+    uint8_t age;                // looks since the exposure changed, up to 255
 };
 
 enum sg_expose_stage {
@@ -45,6 +46,7 @@ enum sg_expose_stage {
     SG_EXPOSE_REFINE = 1,       // so does this one, if it finds much to correct
     SG_EXPOSE_VERIFY = 2,       // the next sample is taken as the measure
     SG_EXPOSE_TRACK = 3,        // only what lasts, and what ambient light does
+    SG_EXPOSE_WATCH = 4,        // full soon after it was chosen: light that flickers is watched first
 };
 
 struct sg_expose {

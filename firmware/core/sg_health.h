@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Is a channel at fault? From its codes, its exposure, and the range that the model was calibrated in.
 //
-// Faults must last PATIENCE looks, and must be gone as long to be forgotten. Cost: one channel a cycle.
+// Faults must last PATIENCE looks, and must be gone as long to be forgotten. One channel every eighth cycle is enough.
 #ifndef SG_HEALTH_H
 #define SG_HEALTH_H
 
@@ -16,7 +16,7 @@ enum sg_health_fault {
     SG_HEALTH_HIGH = 8,         // an octave or more above it
 };
 enum sg_health_limits {
-    SG_HEALTH_PATIENCE = 42,            // looks at a channel: 0.25 s at 6 ms a look
+    SG_HEALTH_PATIENCE = 6,             // looks at a channel: 0.29 s at 48 ms a look
     SG_HEALTH_NOTHING_CODE = 4,         // at and below, lit and unlit, nothing came
     SG_HEALTH_FULL_CODE = 1000,
     SG_HEALTH_SHORT_CYCLES = 128,       // full even at this exposure
