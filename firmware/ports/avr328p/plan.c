@@ -156,10 +156,11 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
     match -= 3 * slot;
 }
 
-void plan_write(struct plan *plan, const struct hal_timing *timing, uint8_t lights)
+void plan_write(struct plan *plan, const struct hal_timing *timing, uint8_t lights, uint8_t phase)
 {
-    to = plan->event;
-    word = to;
-    for (uint8_t phase = 0; phase < 3; phase++)
-        pair(plan, timing, lights, phase);
+    if (phase == 0) {
+        to = plan->event;
+        word = to;
+    }
+    pair(plan, timing, lights, phase);
 }

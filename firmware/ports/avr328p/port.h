@@ -27,9 +27,9 @@ enum port_limits {
     EXPOSURE_LESS_CYCLES = 120,
     LIGHTS_AHEAD_CYCLES = 120,
     LOCKOUT_MS = 1000,              // lights stay off that long after a reset by the watchdog
-    SLOT_A = 0x6800,
-    SLOT_B = 0x7000,
-    SLOT_BYTES = 2048,
+    SLOT_A = 0x6C00,
+    SLOT_B = 0x7200,
+    SLOT_BYTES = 1536,
 };
 
 // boot.c

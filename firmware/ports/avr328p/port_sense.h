@@ -106,7 +106,7 @@ extern const uint8_t plan_place[2][HAL_CHANNELS];        // in flash
 uint8_t plan_channel(uint8_t wiring, uint8_t place);    // of the sensor at a place: 2 * pair, + 1 for its second
 // Limits, and two releases not too near each other.
 void plan_clip(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t wiring, uint16_t slot_cycles);
-// From plan->exposure_cycles, which are clipped, and plan->slot_cycles.
-void plan_write(struct plan *plan, const struct hal_timing *timing, uint8_t lights);
+// One list, from plan->exposure_cycles, which are clipped, and plan->slot_cycles; in order 0, 1, 2.
+void plan_write(struct plan *plan, const struct hal_timing *timing, uint8_t lights, uint8_t phase);
 
 #endif

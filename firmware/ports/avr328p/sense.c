@@ -54,6 +54,7 @@ static uint16_t exposure[HAL_CHANNELS];     // asked for, clipped
 static uint16_t slot;                       // of `timing`
 static uint32_t pause_new;
 static uint8_t timing_new, plan_new;        // asked for and not in a plan yet
+static uint8_t written;                     // lists of the next plan
 static uint8_t locked_out;
 static uint8_t took;                        // cycles taken, low byte
 static uint16_t late_frames;
@@ -265,17 +266,25 @@ SELDOM void hal_set_timing(struct hal_timing *t)
     plan_clip(exposure, t->wiring, n);
     timing_new = 1;
     plan_new = 1;
+    written = 0;
 }
 
-SELDOM static void write_plan(uint8_t index)
+// One list of the plan that is not in use, and when all are written it is the next.
+SELDOM static void write_plan(void)
 {
+    const uint8_t index = !plan_next;
     struct plan *plan = &sense_plan[index];
-    memcpy(plan->exposure_cycles, exposure, sizeof exposure);
-    plan->slot_cycles = slot;
-    plan_write(plan, &timing, timing.lights && !locked_out);
+    if (written == 0) {
+        plan_new = 0;
+        memcpy(plan->exposure_cycles, exposure, sizeof exposure);
+        plan->slot_cycles = slot;
+    }
+    plan_write(plan, &timing, timing.lights && !locked_out, written);
+    if (++written != 3)
+        return;
+    written = 0;
     if (shown_plan == index)
         shown_plan = NONE;
-    plan_new = 0;
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
         plan_next = index;
         if (timing_new) {
@@ -294,10 +303,11 @@ void sense_poll(void)
     if (locked_out && sense_wraps >= LOCKOUT_WRAPS) {
         locked_out = 0;
         plan_new = 1;
+        written = 0;
     }
     // The other plan is free when neither the running cycle nor the newest complete one follows it.
-    if (plan_new && sense_current == plan_next && filling()->other->plan == plan_next)
-        write_plan(!plan_next);
+    if ((plan_new || written) && sense_current == plan_next && filling()->other->plan == plan_next)
+        write_plan();
     // Its other GND slot must be over, and the same plan go on.
     if (supply == SUPPLY_WANTED) {
         ATOMIC_BLOCK(ATOMIC_FORCEON) {
@@ -316,7 +326,10 @@ SELDOM void sense_start(struct hal_timing *t, uint16_t exposure_cycles[HAL_CHANN
     memcpy(exposure, exposure_cycles, sizeof exposure);
     hal_set_timing(t);
     memcpy(exposure_cycles, exposure, sizeof exposure);
-    write_plan(0);
+    plan_next = 1;
+    do {
+        write_plan();
+    } while (written);
     begin_frame();
     ring[0].other = &ring[1];
     ring[1].other = &ring[0];
