@@ -24,19 +24,25 @@ static const uint8_t before[2][HAL_CHANNELS] SG_ROM = {
 static struct hal_timing timing;        // in force
 static uint16_t wanted_mark;            // CRC of what was asked for: the port may have taken something close to it
 static uint8_t faulty;                  // a channel is
+static uint8_t alarms;                  // bits of enum sg_alarm, as last looked at
 static uint8_t turn;
 static uint8_t look;                    // at the health of this channel next
 static uint16_t probe_seq;
 static uint8_t probe_cycles;            // to come
 
+SELDOM static void look_at_alarms(void)
+{
+    alarms = hal_alarm() | (app_live.lights ? 0 : (uint8_t)SG_ALARM_LIGHTS_OFF);
+}
+
 uint8_t app_alarm(void)
 {
-    return hal_alarm() | (app_live.lights ? 0 : (uint8_t)SG_ALARM_LIGHTS_OFF);
+    return alarms;
 }
 
 uint8_t app_fault(void)
 {
-    return faulty || app_alarm();
+    return faulty | alarms;
 }
 
 // Ask the port for the exposures wanted, and for the rest take what it made of them.
@@ -89,6 +95,7 @@ SELDOM void app_sense_start(const struct hal_timing *begin)
     memcpy(cycles, app_live.exposure_cycles, sizeof cycles);
     hal_start(&timing, cycles);
     light_again();
+    look_at_alarms();
     expose_at(app_live.exposure_cycles);
     sg_health_start(&app.health);
 }
@@ -101,6 +108,7 @@ SELDOM void app_sense_timing(const struct hal_timing *wanted)
     wanted_mark = mark;
     timing = *wanted;
     hal_set_timing(&timing);
+    look_at_alarms();
     light_again();
     expose_again();
 }
@@ -163,11 +171,14 @@ static void look_at(const struct sg_reading *reading)
 void app_sense_cycle(const struct hal_cycle *cycle)
 {
     const struct sg_reading *reading = &cycle->reading;
+    const uint8_t health = (++turn & (HEALTH_TURNS - 1)) == 0;
+    if (health)
+        look_at_alarms();
     // In the dark there is nothing to learn.
-    if (app_alarm() & (SG_ALARM_LOCKOUT | SG_ALARM_LIGHTS_OFF))
+    if (alarms & (SG_ALARM_LOCKOUT | SG_ALARM_LIGHTS_OFF))
         return;
     // One or the other: what a cycle takes at most counts.
-    if ((++turn & (HEALTH_TURNS - 1)) == 0)
+    if (health)
         look_at(reading);
     else if (app_live.exposure_auto
              && sg_expose_cycle(&app.expose, reading->lit_code, reading->unlit_code, reading->exposure_cycles))
@@ -180,7 +191,7 @@ SELDOM int8_t app_probe(uint8_t emitter, uint16_t seq)
         return SG_E_ARG;
     if (probe_cycles)
         return SG_E_BUSY;
-    if (app_alarm() & (SG_ALARM_LOCKOUT | SG_ALARM_LIGHTS_OFF))
+    if (alarms & (SG_ALARM_LOCKOUT | SG_ALARM_LIGHTS_OFF))
         return SG_E_STATE;
     probe_seq = seq;
     probe_cycles = PROBE_BEFORE + PROBE_SUM + PROBE_AFTER;
