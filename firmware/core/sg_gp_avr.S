@@ -100,7 +100,9 @@
     channel \load, s4l, s4h
     channel \load, s5l, s5h
 
-    cpi t2, 0x0C                ; T >= 12 * 2^16: k = 0, which the table says from there on
+    cpi t2, 0x0C                ; T >= 12 * 2^16: k = 0, which the table says there
+    sbc r0, r0                  ; all ones below; the carry stays
+    and t1, r0
     brlo 2f                     ; as long as the instruction it jumps over
     ldi t2, 0x0C
 2:

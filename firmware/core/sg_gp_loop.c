@@ -14,7 +14,7 @@ static inline uint16_t kernel_q16(uint32_t t)
 {
     uint16_t index = (uint16_t)(t >> 8) >> 1;  // 23 bits: whole bytes first, they cost nothing
     if (index >= 1536U)
-        index = 1536U;  // from here on the table holds zeros
+        index = 1536U;  // where the table holds a zero
     const uint16_t level_q16 = sg_rom_word(&sg_gp_exp_table[index]);
     const uint8_t fraction_q8 = (uint8_t)((uint16_t)t >> 1);
     return (uint16_t)(level_q16 - ((uint16_t)((uint16_t)(level_q16 >> 8) * fraction_q8) >> 7));

@@ -8,7 +8,7 @@
 #include <stdint.h>
 
 // 2^16 exp(-(i / 128)) for i = T >> 9, Q0.16; zeros from 1420 on. See make_tables.py.
-enum { SG_GP_EXP_ENTRIES = 1664 };
+enum { SG_GP_EXP_ENTRIES = 1537 };
 extern const uint16_t sg_gp_exp_table[SG_GP_EXP_ENTRIES];
 
 struct sg_gp_sum {
