@@ -66,70 +66,92 @@ static void event(uint8_t kind, int16_t at)
     to += 2;
 }
 
+static __attribute__((noinline)) uint8_t bit(uint8_t i)
+{
+    return 1 << i;
+}
+
+static void put(uint8_t byte)
+{
+    *to++ = byte;
+}
+
 static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lights, uint8_t phase)
 {
     const int16_t slot = (int16_t)plan->slot_cycles;
     uint8_t *const begin = to;
-    uint8_t portc = 0, portd = PORTD_DARK, left = 2, set = 1, bits[2], admux[3];
-    int16_t release[2], service = HOLD_AT - slot;
+    const uint8_t a = plan_channel(timing->wiring, 2 * phase), b = plan_channel(timing->wiring, 2 * phase + 1);
+    uint8_t bits = bit(a), more = bit(b);
+    uint8_t admux_a = ADMUX_CHANNEL_0 + a, admux_b = ADMUX_CHANNEL_0 + b;
+    uint8_t portc = PORTC_ALL & (uint8_t)~(bits | more), portd = PORTD_DARK;
 
-    admux[0] = ADMUX_GROUND;
-    for (uint8_t k = 0; k < 2; k++) {
-        const uint8_t i = plan_channel(timing->wiring, 2 * phase + k);
-        admux[1 + k] = ADMUX_CHANNEL_0 + i;
-        bits[k] = 1 << i;
-        release[k] = (k + 1) * slot + SAMPLE_CYCLES - (int16_t)plan->exposure_cycles[i];
-    }
-    uint8_t emitters = PORTC_ALL & (uint8_t)~(bits[0] | bits[1]);
-    if (timing->probe < HAL_CHANNELS)
-        emitters = 1 << timing->probe;
     if (timing->wiring != SG_WIRING_LEDS) {
+        portc = 0;
         if (timing->probe == phase || timing->probe >= HAL_CHANNELS)
-            portd |= 1 << (FIRST_EMITTER + phase);
-    } else {
+            portd |= bit(FIRST_EMITTER + phase);
+    } else if (timing->probe < HAL_CHANNELS) {
         // The only emitter is at 5 V when its turn comes: the converter is not to see that.
-        for (uint8_t k = 0; k < 2; k++)
-            if (bits[k] == emitters) {
-                bits[k] = 0;
-                admux[1 + k] = ADMUX_GROUND;
-            }
-        portc = emitters;
+        portc = bit(timing->probe);
+        if (bits == portc) {
+            bits = 0;
+            admux_a = ADMUX_GROUND;
+        }
+        if (more == portc) {
+            more = 0;
+            admux_b = ADMUX_GROUND;
+        }
     }
     if (!lights) {
         portc = 0;
         portd = PORTD_DARK;
     }
-    uint8_t next = release[1] < release[0];
-    uint8_t held = PORTC_ALL & (uint8_t)~bits[next];
-    if (release[0] == release[1]) {
-        held &= (uint8_t)~bits[1];
+
+    int16_t release = slot + SAMPLE_CYCLES - (int16_t)plan->exposure_cycles[a];
+    int16_t later = 2 * slot + SAMPLE_CYCLES - (int16_t)plan->exposure_cycles[b];
+    uint8_t left = 2;
+    if (release == later) {
+        bits |= more;
         left = 1;
+    } else if (later < release) {
+        const int16_t r = release;
+        const uint8_t m = bits;
+        release = later;
+        later = r;
+        bits = more;
+        more = m;
     }
 
-    for (uint8_t k = 0; k < 4; k++) {
+    uint8_t set = 1, admux = ADMUX_GROUND;
+    int16_t trigger = -slot;            // of the slot that the service is in
+    int16_t service = HOLD_AT - slot;
+    for (uint8_t k = 0;; k++) {
         uint8_t released = 0;
         while (left) {
-            int16_t at = release[next] - (set ? LIGHT_LEAD_CYCLES : RELEASE_LEAD_CYCLES);
-            // A service right after a release costs no interrupt of its own; but lights go out in time.
-            if (k < 3 && at >= service + (k == 0 ? HOLD_CYCLES : SPACING_CYCLES)
-                && (k == 0 || release[next] > (int16_t)(k * slot) - SERVICE_BEFORE_CYCLES))
+            int16_t at = release - (set ? LIGHT_LEAD_CYCLES : RELEASE_LEAD_CYCLES);
+            // A service right after a release costs no interrupt of its own; but lights go out in time, and the
+            // result is read before the next.
+            if (k == 0) {
+                if (at >= service + HOLD_CYCLES)
+                    break;
+                if (set)
+                    at = service;       // no time for holding first
+            } else if (k != 3 && at >= service + SPACING_CYCLES && release > trigger + SERVICE_LATEST) {
                 break;
-            if (k == 0 && set)
-                at = service;           // no time for holding first
+            }
             event((set ? EVENT_SET_RELEASE : EVENT_RELEASE) | EVENT_ALONE, at);
             if (set) {
-                *to++ = portc;
-                *to++ = portd;
-                *to++ = (uint8_t)(release[next] - at - LEAD_LESS_CYCLES);
+                put(portc);
+                put(portd);
+                put((uint8_t)(release - at - LEAD_LESS_CYCLES));
+                set = 0;
             }
-            *to++ = held;
+            put(PORTC_ALL & (uint8_t)~bits);
             // With the release, if the last sample has been taken long enough.
-            released = release[next] >= service + WITH_RELEASE_CYCLES;
-            if (service < release[next] + AFTER_RELEASE_CYCLES)
-                service = release[next] + AFTER_RELEASE_CYCLES;
-            next = !next;
-            held &= (uint8_t)~bits[next];
-            set = 0;
+            released = release >= service + WITH_RELEASE_CYCLES;
+            if (service < release + AFTER_RELEASE_CYCLES)
+                service = release + AFTER_RELEASE_CYCLES;
+            bits |= more;
+            release = later;
             left--;
         }
         if (k == 3)
@@ -137,9 +159,9 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
         uint8_t kind = EVENT_STORE;
         if (k == 0 && set)
             kind = EVENT_DARK_STORE;
-        else if (k == 1 && phase == 0)
+        if (k == 1 && phase == 0)
             kind = EVENT_COMPLETE;
-        else if (k == 2 && phase != 0)
+        if (k == 2 && phase != 0)
             kind = EVENT_SERVICE;
         if (released)
             word[1] ^= EVENT_ALONE ^ kind;
@@ -147,12 +169,13 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
             event(kind, service);
         if (k == 0 && phase == 0)
             plan->first_mux = to;
-        *to++ = admux[k];
-        service = k * slot + SERVICE_AT;
+        put(admux);
+        admux = k == 0 ? admux_a : admux_b;
+        trigger += slot;
+        service = trigger + SERVICE_AT;
     }
     event(phase == 2 ? EVENT_LAST : EVENT_AGAIN, 2 * slot + HOLD_AT);
-    *to = (uint8_t)(to - begin);
-    to++;
+    put((uint8_t)(to - begin));
     match -= 3 * slot;
 }
 

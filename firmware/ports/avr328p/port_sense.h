@@ -26,7 +26,7 @@ enum event {                        // of the word's high byte
 
 enum sense_cycles {
     SERVICE_AT = 40,                // compare match of a service after its slot's trigger, at the earliest
-    SERVICE_BEFORE_CYCLES = 500,    // from the first release it follows to the next trigger, at least
+    SERVICE_LATEST = 388,           // from its slot's trigger to the first release it follows, at most
     HOLD_AT = SAMPLE_CYCLES - 40,   // of the first event after a half's samples; it acts 43 cycles later at the earliest
     RELEASE_LEAD_CYCLES = 104,      // 76 without any other interrupt in the way
     LIGHT_LEAD_CYCLES = 112,

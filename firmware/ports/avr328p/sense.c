@@ -246,10 +246,10 @@ SELDOM void hal_set_timing(struct hal_timing *t)
     uint16_t n = SLOT_CYCLES_MIN;
     for (uint16_t left = t->period_cycles; left >= SLOTS * (SLOT_CYCLES_MIN + 1) && n < SLOT_CYCLES_MAX; left -= SLOTS)
         n++;
-    const uint16_t step = SLOTS * t->repeats;
     uint32_t pause = t->frame_cycles;
-    for (uint8_t k = 0; k < t->repeats; k++)
+    for (uint8_t k = t->repeats; k != 0; k--)
         pause = pause > SLOTS * n ? pause - SLOTS * n : 0;
+    const uint16_t step = SLOTS * t->repeats;
     if (pause < step)
         pause = 0;
     // A pause too short to make: shorter cycles, a longer pause.
@@ -258,8 +258,8 @@ SELDOM void hal_set_timing(struct hal_timing *t)
         pause += step;
     }
     t->period_cycles = SLOTS * n;
-    if (t->frame_cycles || pause)
-        t->frame_cycles = (uint32_t)t->repeats * t->period_cycles + pause;
+    if (!pause)
+        t->frame_cycles = 0;
     timing = *t;
     slot = n;
     pause_new = pause;

@@ -430,15 +430,18 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
     // The receiver holds no more than comes while a release is waited for.
     __asm__ volatile("sense_receive_first:" "\t"
                      "push r30" "\n\t"
-                     "push r31" "\n\t");
-    serial_receive();
-    __asm__ volatile("pop r31" "\n\t"
+                     "push r31" "\n\t"
+                     "rcall sense_byte" "\n\t"
+                     "pop r31" "\n\t"
                      "pop r30" "\n\t"
                      "rjmp sense_wait_lit" "\n"
-                     "sense_receive:" "\t");
+                     "sense_receive_next:" "\t"
+                     "rcall sense_byte" "\n\t"
+                     "rjmp sense_next" "\n"
+                     "sense_receive:" "\t"
+                     "rcall sense_byte" "\n\t"
+                     "rjmp sense_exit" "\n"
+                     "sense_byte:" "\t");
     serial_receive();
-    __asm__ volatile("rjmp sense_exit" "\n"
-                     "sense_receive_next:" "\t");
-    serial_receive();
-    __asm__ volatile("rjmp sense_next" "\n\t");
+    __asm__ volatile("ret" "\n\t");
 }
