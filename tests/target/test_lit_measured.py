@@ -3,9 +3,12 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sparsegaze import power, timing
+from sparsegaze.device import Device
+from sparsegaze.errors import DeviceError
 from sparsegaze.headset import load_headset
 from sparsegaze.timing import Timing
 from sparsegaze.transport import open_link
@@ -135,3 +138,41 @@ def test_low_power_lights_and_sleeps_as_the_budget_says(lit):
     assert asleep > 1 - power.AWAKE_CYCLES / 64_000
     _, _, awake = lit(frame=64_000, sleep=0)
     assert awake["asleep_cycles"] == 0
+
+
+def test_no_storm_of_commands_lights_longer_than_eye_safety_assumes(virtual_nano, firmware_hex, repo_root):
+    """The shipped firmware, told everything it understands about light and time, again and again."""
+    headset = load_headset(repo_root / "headsets" / "led2gaze.toml")
+    nano, rng = virtual_nano(map=False, unpaced=True, app=firmware_hex), np.random.default_rng(5)
+    with Device(nano.port) as device:
+        device.link.sleep(1.5)
+        nano.control.counters_clear()
+        began, asked, refused = nano.control.time().cycle, 0, 0
+        device.set_stream(raw=True, gaze=True, counts=True)
+        while asked < 150:
+            kind = rng.integers(4)
+            try:
+                if kind == 0:
+                    device.exposure(us=rng.choice([0.0, 4.0, 50.0, 103.0, 158.0, 4000.0], 6))
+                elif kind == 1:
+                    device.exposure(auto=True)
+                elif kind == 2:
+                    device.probe(int(rng.integers(6)))
+                else:
+                    device.settings(
+                        rate_hz=int(rng.choice([0, 50, 200, 400, 700])),
+                        repeats=int(rng.choice([1, 2, 4, 16])),
+                        power=str(rng.choice(["normal", "low"])),
+                    )
+            except (DeviceError, ValueError):
+                refused += 1
+            asked += 1
+        counted = nano.control.counters()
+        cycles = nano.control.time().cycle - began
+    duty = [counted[f"lit_cycles_{i}"] / cycles for i in range(6)]
+    print(asked, "commands,", refused, "refused,", cycles / 16e6, "s, lit", duty, counted["longest_pulse_cycles"])
+    assert refused < asked / 2 and counted["wdt_resets"] <= 1
+    assert counted["longest_pulse_cycles"] <= Timing(timing.SLOT_CYCLES_MAX).lit_cycles(timing.LATE_CYCLES)
+    settings = Timing(), Timing(timing.SLOT_CYCLES_MAX)
+    most = max(one.emitter_duty(headset, timing.LATE_CYCLES).max() for one in settings)
+    assert 0.02 < min(duty) and max(duty) <= most
