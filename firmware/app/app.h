@@ -58,7 +58,7 @@ struct app_live {
     uint16_t rate_hz;                   // wanted; 0: as fast as can be
     int8_t curve_q10[HAL_CHANNELS];
     int8_t zero_q2;
-    uint8_t reserved;
+    uint8_t reserved[3];
     uint8_t repeats;
     uint8_t wiring;
     uint8_t power;

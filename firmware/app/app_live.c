@@ -14,7 +14,7 @@ enum {
     // Those set by command once they have rested for so many looks: a program may try many.
     LOOKS_REST = 2,
 };
-_Static_assert(sizeof(struct app_live) == 54, "layout in EEPROM");
+_Static_assert(sizeof(struct app_live) == 56, "layout in EEPROM");
 _Static_assert(sizeof(struct app_live) <= HAL_RECORD_MAX, "fits the port's store");
 
 struct app_live app_live;

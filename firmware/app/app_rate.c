@@ -7,13 +7,13 @@
 
 // Cycles of a 16 MHz AVR, measured (tests/budget.csv; tests/target/test_settings.py holds them to it).
 enum app_rate_cost {
-    COST_SENSE = 3000,          // interrupts of one sensing cycle
-    COST_CYCLE = 1700,          // taking a cycle's readings, exposure and health of one channel, the loop
-    COST_FRAME = 2500,          // features, flags, and what a frame needs besides
-    COST_MODEL = 2770,          // inference: with any model, and per vector
-    COST_VECTOR = 150,
-    COST_PACKET = 700,          // a stream's packet: encoding and the UART's interrupts, and per byte
-    COST_BYTE = 105,
+    COST_SENSE = 4300,          // interrupts of one sensing cycle; they send the gaze as well
+    COST_FRAME = 3800,          // readings, features, exposure and health of one channel, the loop
+    COST_MODEL = 2850,          // inference: with any model, and per vector
+    COST_VECTOR = 152,
+    COST_GAZE = 1100,           // its packet
+    COST_RAW = 3800,            // and the turns of the loop that send what the interrupts do not
+    COST_COUNTS = 5000,
     COST_REQUEST = 500,         // what a request may take of a frame
 };
 
@@ -66,11 +66,13 @@ SELDOM static uint16_t infer_us(void)
 // Between the last readings of a frame and the end of all work that this brings, interrupts included.
 SELDOM static uint16_t work_us(void)
 {
-    uint16_t cycles = COST_SENSE + COST_CYCLE + COST_FRAME + COST_REQUEST + stream_bytes() * COST_BYTE;
-    for (uint8_t bit = SG_STREAM_RAW; bit <= SG_STREAM_COUNTS; bit <<= 1) {
-        if (app.stream & bit)
-            cycles += COST_PACKET;
-    }
+    uint16_t cycles = COST_SENSE + COST_FRAME + COST_REQUEST;
+    if (app.stream & SG_STREAM_GAZE)
+        cycles += COST_GAZE;
+    if (app.stream & SG_STREAM_RAW)
+        cycles += COST_RAW;
+    if (app.stream & SG_STREAM_COUNTS)
+        cycles += COST_COUNTS;
     return cycles / CYCLES_PER_US + 1 + infer_us();
 }
 

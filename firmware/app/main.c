@@ -159,7 +159,8 @@ static void finish_frame(const struct hal_cycle *cycle)
     HAL_BEGIN(HAL_SECTION_INFER);
     sg_track_infer(model, app.feature, flags, recentre, &out->gaze);
     HAL_END(HAL_SECTION_INFER);
-    if (out->gaze.flags & SG_FLAG_OUT_OF_RANGE) {
+    // Where an exposure still has to follow the light, features say nothing about the lids.
+    if ((out->gaze.flags & SG_FLAG_OUT_OF_RANGE) && !(flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED))) {
         out_us = t_us;
         recovering = 1;
     }

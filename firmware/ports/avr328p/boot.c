@@ -7,6 +7,7 @@
 
 enum {
     PAINT = 0xC5,
+    STRIDE = 8,
     BOOTLOADER_VERSION_AT = 0x7FFE,     // Optiboot leaves minor, major here; other bootloaders leave FF FF
     OPTIBOOT_KEEPS_CAUSE = 0x0406,      // from 4.6 on MCUSR is handed over in r2
 };
@@ -94,8 +95,11 @@ uint8_t boot_reset_cause(void)
 
 uint16_t boot_stack_free(void)
 {
+    // In strides, because a frame waits meanwhile: what is deepest on a stack is addresses and registers in a row.
     const uint8_t *p = &__heap_start;
-    while (p <= (const uint8_t *)RAMEND && *p == PAINT)
+    while (p[STRIDE - 1] == PAINT)
+        p += STRIDE;
+    while (*p == PAINT)
         p++;
     return (uint16_t)(p - &__heap_start);
 }
