@@ -126,7 +126,7 @@ static struct taken *filling(void)
     return out < ring[1].code ? &ring[0] : &ring[1];
 }
 
-// Interrupts off. The first GND slot of the cycle that makes sense_done `of` converts the divider at A7 instead; the
+// The first GND slot of the cycle that makes sense_done `of` converts the divider at A7 instead; the
 // interrupt sets it back when that is under way.
 static void ask_supply(struct plan *plan, uint8_t of)
 {
@@ -166,6 +166,7 @@ SELDOM static void begin_frame(void)
         sense_last = timing.repeats - 1;
         sense_slot = sense_plan[plan_next].slot_cycles;
         sense_pause = pause_cycles != 0;
+        DDRD = timing.wiring == SG_WIRING_LEDS ? 0 : 7 << FIRST_EMITTER;
         const uint16_t second = sense_slot - HOLD_AT + SERVICE_AT;
         sense_gap[0] = (uint8_t)second;
         sense_gap[1] = EVENT_DARK_STORE | second >> 8;
@@ -308,15 +309,12 @@ void sense_poll(void)
     // The other plan is free when neither the running cycle nor the newest complete one follows it.
     if ((plan_new || written) && sense_current == plan_next && filling()->other->plan == plan_next)
         write_plan();
-    // Its other GND slot must be over, and the same plan go on.
-    if (supply == SUPPLY_WANTED) {
-        ATOMIC_BLOCK(ATOMIC_FORCEON) {
-            struct plan *plan = &sense_plan[plan_next];
-            const uint16_t since = TCNT1 - sense_base;
-            if (sense_current == plan_next && sense_list_next == plan->event && since > 3 * sense_slot
-                && since < (SLOTS - 2) * sense_slot)
-                ask_supply(plan, sense_done + 2);
-        }
+    // Its other GND slot must be over, and the same plan go on. Interrupts stay on: what is left of the cycle is long.
+    if (supply == SUPPLY_WANTED && sense_current == plan_next && sense_list_next == sense_plan[plan_next].event) {
+        const uint8_t done = sense_done;
+        const uint16_t since = ticks_now() - sense_base;
+        if (since > 3 * sense_slot && since < 12 * sense_slot && done == sense_done)
+            ask_supply(&sense_plan[plan_next], done + 2);
     }
 }
 
@@ -339,8 +337,6 @@ SELDOM void sense_start(struct hal_timing *t, uint16_t exposure_cycles[HAL_CHANN
     PORTC = 0;
     PORTD = PORTD_DARK;
     DDRC = PORTC_ALL;
-    if (timing.wiring == SG_WIRING_PHOTODIODES)
-        DDRD = 7 << FIRST_EMITTER;
     DIDR0 = PORTC_ALL;
     ADCSRB = (1 << ADTS2) | (1 << ADTS0);           // Timer1 compare B
     ADCSRA = (1 << ADEN) | (1 << ADATE) | (1 << ADPS2) | (1 << ADPS1);      // 250 kHz
