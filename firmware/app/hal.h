@@ -58,6 +58,8 @@ int hal_poll(void);
 
 // Device time, microseconds since boot; wraps after 2^32.
 uint32_t hal_now_us(void);
+// Its low half, at less cost.
+uint16_t hal_now_us16(void);
 
 // Exposures from a cycle soon on, clipped to the port's limits and to what the timing allows, and moved by a few
 // per cent where two releases would collide: `exposure_cycles` is what was taken. Whole: no cycle sees half of it.

@@ -36,8 +36,9 @@ void plan_clip(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t wiring, uint16_t 
         const uint8_t second = place & 1;
         uint16_t *cycles = &exposure_cycles[plan_channel(wiring, place)];
         const uint16_t most = (second ? 3 : 2) * slot_cycles - EXPOSURE_LESS_CYCLES;
-        if (*cycles < EXPOSURE_MIN_CYCLES)
-            *cycles = EXPOSURE_MIN_CYCLES;
+        const uint8_t least = second ? EXPOSURE_SECOND_MIN_CYCLES : EXPOSURE_MIN_CYCLES;
+        if (*cycles < least)
+            *cycles = least;
         if (*cycles > most)
             *cycles = most;
         const int16_t apart = *cycles - same;

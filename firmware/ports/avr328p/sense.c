@@ -6,13 +6,15 @@
 #include <avr/pgmspace.h>
 #include <string.h>
 
-#define SELDOM __attribute__((noinline, cold, optimize("Os")))
+#define SELDOM __attribute__((noinline, cold))
+#define HOT __attribute__((optimize("O2")))
 
 enum {
     NONE = 255,
     WAIT_AT = 120,                  // compare match of EVENT_WAIT after that of the service before it
     PAUSE_LEAST_SLOTS = 3,
     RESTART_CYCLES = 1500,          // before a frame that begins with another timing
+    PAUSE_MOST = 16000000,          // a frame a second, at least
     PAUSE_CHUNK_CYCLES = 0x8000,    // waited for at once
     PAUSE_WHOLE_CYCLES = 0xC000,
     LOCKOUT_WRAPS = LOCKOUT_MS * (F_CPU / 1000) / 65536 + 1,
@@ -45,14 +47,14 @@ static volatile uint8_t alive;
 static volatile uint8_t plan_next;          // index of the plan to begin with, or to go on with
 static volatile uint8_t restart;            // timing changed: begin a frame with it
 static uint8_t pausing;
-static uint32_t pause_left;
-static uint32_t pause_cycles;               // between frames; 0: none
+static __uint24 pause_left;
+static __uint24 pause_cycles;               // between frames; 0: none
 static volatile uint16_t late_slots;
 
 static struct hal_timing timing;            // asked for
 static uint16_t exposure[HAL_CHANNELS];     // asked for, clipped
 static uint16_t slot;                       // of `timing`
-static uint32_t pause_new;
+static __uint24 pause_new;
 static uint8_t timing_new, plan_new;        // asked for and not in a plan yet
 static uint8_t written;                     // lists of the next plan
 static uint8_t locked_out;
@@ -98,7 +100,7 @@ static uint16_t ticks_now(void)
 
 // TCNT1, and how often it wrapped. Read again if the interrupt went on meanwhile, which is off as little as can be: a
 // release may be waiting.
-static uint32_t now(uint16_t *ticks)
+HOT static uint32_t now(uint16_t *ticks)
 {
     uint32_t wraps;
     uint8_t before;
@@ -110,11 +112,26 @@ static uint32_t now(uint16_t *ticks)
     return wraps;
 }
 
+// Of 16-bit pieces, because a shift of 32 bits is a loop.
+static inline uint32_t us_of(uint32_t wraps, uint16_t ticks)
+{
+    const uint16_t low = (uint16_t)wraps << 12 | ticks >> 4;
+    const uint16_t high = (uint16_t)(wraps >> 16) << 12 | (uint16_t)wraps >> 4;
+    return (uint32_t)high << 16 | low;
+}
+
 uint32_t hal_now_us(void)
 {
     uint16_t ticks;
     const uint32_t wraps = now(&ticks);
-    return wraps << 12 | ticks >> 4;
+    return us_of(wraps, ticks);
+}
+
+HOT uint16_t hal_now_us16(void)
+{
+    uint16_t ticks;
+    const uint16_t wraps = (uint16_t)now(&ticks);
+    return (uint16_t)(wraps << 12) | ticks >> 4;
 }
 
 static struct taken *filling(void)
@@ -247,7 +264,7 @@ SELDOM void hal_set_timing(struct hal_timing *t)
     uint16_t n = SLOT_CYCLES_MIN;
     for (uint16_t left = t->period_cycles; left >= SLOTS * (SLOT_CYCLES_MIN + 1) && n < SLOT_CYCLES_MAX; left -= SLOTS)
         n++;
-    uint32_t pause = t->frame_cycles;
+    __uint24 pause = t->frame_cycles > PAUSE_MOST ? PAUSE_MOST : (__uint24)t->frame_cycles;
     for (uint8_t k = t->repeats; k != 0; k--)
         pause = pause > SLOTS * n ? pause - SLOTS * n : 0;
     const uint16_t step = SLOTS * t->repeats;
@@ -261,6 +278,8 @@ SELDOM void hal_set_timing(struct hal_timing *t)
     t->period_cycles = SLOTS * n;
     if (!pause)
         t->frame_cycles = 0;
+    else if (t->frame_cycles > PAUSE_MOST)
+        t->frame_cycles = PAUSE_MOST;
     timing = *t;
     slot = n;
     pause_new = pause;
@@ -390,7 +409,7 @@ SELDOM static void show_late(struct sg_reading *reading, struct late *late)
     memset(late, 0, sizeof *late);
 }
 
-uint8_t sense_take(struct hal_cycle *cycle)
+HOT uint8_t sense_take(struct hal_cycle *cycle)
 {
     struct sg_reading *reading = &cycle->reading;
     const struct taken *from;
@@ -429,7 +448,7 @@ uint8_t sense_take(struct hal_cycle *cycle)
 
     wraps -= (uint8_t)((uint8_t)wraps - from->wraps);
     const uint16_t low = from->end & 15;
-    cycle->t_us = (wraps << 12 | from->end >> 4) - ((uint16_t)(mean_to_end - low + 8) >> 4);
+    cycle->t_us = us_of(wraps, from->end) - ((uint16_t)(mean_to_end - low + 8) >> 4);
     cycle->span_us = (uint16_t)(mean_to_last + 8) >> 4;
     cycle->seq = from->seq;
     cycle->left = from->left;

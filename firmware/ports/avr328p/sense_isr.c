@@ -123,6 +123,9 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "lds r24, %[head]" "\n\t"
         "cp r30, r24" "\n\t"
         "breq 5f" "\n\t"
+        "lds r24, %[control]" "\n\t"
+        "sbrc r24, %[itself]" "\n\t"           // it has its own interrupt
+        "rjmp 5f" "\n\t"
         "mov r24, r30" "\n\t"
         "ldi r31, 0" "\n\t"
         "subi r30, lo8(-(%[ring]))" "\n\t"
@@ -165,7 +168,7 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
           [trigger] "i"(_SFR_MEM_ADDR(OCR1BL)), [slot] "i"(&sense_slot), [matched] "I"(OCF1B), [due] "I"(OCF1A),
           [flags] "I"(_SFR_IO_ADDR(TIFR1)), [match] "i"(_SFR_MEM_ADDR(OCR1AL)), [cycles] "M"(EVENT_CYCLES),
           [now] "i"(_SFR_MEM_ADDR(TCNT1L)), [tail] "i"(&tx_tail), [head] "i"(&tx_head), [ring] "i"(tx_ring),
-          [size] "M"(TX_RING), [state] "i"(_SFR_MEM_ADDR(UCSR0A)), [room] "I"(UDRE0), [came] "I"(RXC0),
+          [size] "M"(TX_RING), [state] "i"(_SFR_MEM_ADDR(UCSR0A)), [control] "i"(_SFR_MEM_ADDR(UCSR0B)), [itself] "I"(UDRIE0), [room] "I"(UDRE0), [came] "I"(RXC0),
           [data] "i"(_SFR_MEM_ADDR(UDR0)), [end] "M"(2 * HAL_SECTION_SENSE + 2),
           [mark] "I"(_SFR_IO_ADDR(GPIOR0)));
     __asm__ volatile(

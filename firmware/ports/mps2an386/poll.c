@@ -54,6 +54,11 @@ uint32_t hal_now_us(void)
     return now_us + (scope_now() - seen_ticks) / TICKS_PER_US;
 }
 
+uint16_t hal_now_us16(void)
+{
+    return (uint16_t)hal_now_us();
+}
+
 int hal_poll(void)
 {
     if (serial_poll())

@@ -40,6 +40,11 @@ uint32_t hal_now_us(void)
     return 0;
 }
 
+uint16_t hal_now_us16(void)
+{
+    return 0;
+}
+
 void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS])
 {
     (void)exposure_cycles;
