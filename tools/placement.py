@@ -48,10 +48,11 @@ from sparsegaze.simulate import REFERENCE_MEAN  # noqa: E402
 from sparsegaze.targets import calibration_plan, validation_plan  # noqa: E402
 
 NOMINAL_NA = 200.0  # photocurrent of REFERENCE_MEAN: [photocurrent].nominal_na of physics.toml
-# Relative noise of one frame at 1001 Hz, measured on the virtual Nano by the firmware's port (no ambient light, eye
-# at rest, 216 channels of persons 2000 and 2001): 0.17 % rms at 200 nA, 0.42 % at 75 nA, about 0.15 % in strong
-# light. Below 250 nA the exposure is at its cap, so that less light is a smaller step of the same converter. The
-# model: a power through the first two readings, almost 1 / I, never below the third.
+# Relative noise of one frame at 1001 Hz, measured on the virtual Nano by the firmware's port (no ambient
+# light, eye at rest, 216 channels of persons 2000 and 2001): 0.17 % rms at 200 nA, 0.42 % at 75 nA, about
+# 0.15 % in strong light. Below 250 nA the exposure is at its cap, so that less light is a smaller step of
+# the same converter. The model: a power through the first two readings, almost 1 / I, never below the
+# third.
 NOISE_NOMINAL, NOISE_POWER, NOISE_FLOOR = 0.0017, 0.93, 0.0015
 FIRST_SEARCHED = 1000  # the search sees nobody below this
 SEARCHED = (1000, 1001, 1002, 1003)

@@ -318,8 +318,8 @@ def _radiance(port, milliwatts_sr, seconds, distance_mm, smallest):
 def _assumptions(headset):
     said = [
         "intensity_mw_sr is the most that any LED of the kind emits on its axis at current_ma",
-        "normal: nominal eye, beams as aimed, %.2f V; else: eye within %g mm of its place per axis, turned by "
-        "up to %g degrees, every beam's axis on the same point of the cornea, %.2f V at the board"
+        "normal: nominal eye, beams as aimed, %.2f V; else: eye within %g mm of its place per axis, turned "
+        "by up to %g degrees, every beam's axis on the same point of the cornea, %.2f V at the board"
         % (SUPPLY_V, SEAT_MM, GAZE_DEG, SUPPLY_MOST_V),
         "a fault lights every emitter until the watchdog (%d ms, %d %% slow) resets; then %d ms of dark"
         % (timing.WATCHDOG_MS, round(100 * timing.WATCHDOG_SPREAD), timing.LOCKOUT_MS),

@@ -22,8 +22,9 @@ CONVERTER_MA = 0.3  # ADC and its reference, the same data sheet
 RAIL_FEED_OHM = 330.0  # 5 V to the shunt regulator: what it takes to regulate with no emitter lit
 DIVIDER_OHM = 250e3  # 240k and 10k at the supply pin
 BOARD_MA = 20.0  # of a Nano: USB serial chip 15 mA, power LED 5 mA; by their data sheets, typical
-# Awake in a frame of one sensing cycle, with a model of 30 vectors and the gaze stream: measured on the virtual
-# Nano, 26,400 cycles at 250 Hz and 33,200 at 60 Hz (in the pauses interrupts go on). A test measures it again.
+# Awake in a frame of one sensing cycle, with a model of 30 vectors and the gaze stream: measured on the
+# virtual Nano, 26,400 cycles at 250 Hz and 33,200 at 60 Hz (in the pauses interrupts go on). A test
+# measures it again.
 AWAKE_CYCLES = 30_000
 
 PAPER_LED_MW, PAPER_PHOTODIODE_MW = 800.0, 16.0

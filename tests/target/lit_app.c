@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The port asked for as much light as it will give: timing and exposures by -D, nothing done with what is sensed.
+// The port asked for as much light as it will give: timing and exposures by -D, nothing done with what is
+// sensed.
 // ASK_HANG: after 400 cycles with light it stops with interrupts off, at a moment when emitters are lit.
 #include <avr/interrupt.h>
 #include <avr/io.h>

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lights as the virtual Nano counts them, on its pins and in cycles, beside what eye safety and power assume."""
+"""Lights as the virtual Nano counts them on its pins, beside what eye safety and power assume."""
 
 from pathlib import Path
 
@@ -24,8 +24,9 @@ MOST = 65535
 
 @pytest.fixture
 def lit(port_with, virtual_nano, repo_root):
-    """Factory: what is counted while the port does as asked; lit(wiring, **asked) -> (headset, duty [emitter],
-    counters). storm: bytes arrive back to back all the while; log: file for the electrical moments.
+    """Factory: what is counted while the port does as asked; lit(wiring, **asked) -> (headset,
+    duty [emitter], counters). storm: bytes arrive back to back all the while; log: file for the moments of
+    pins.
     """
 
     def run(wiring="leds", storm=False, seconds=SECONDS, hang=False, log=None, **asked):
@@ -151,13 +152,13 @@ def test_the_shipped_firmware_draws_in_low_power_what_the_budget_says(board, rep
     began = nano.control.time().cycle
     device.link.sleep(1.0)
     counted, cycles = nano.control.counters(), nano.control.time().cycle - began
-    # Charge from the drivers: their pins' and the rail's drop make it some per cent less than 20 mA each; bright
-    # optics make exposures, and so the lights, shorter.
+    # Charge from the drivers: the pins' and the rail's drop make it some per cent less than 20 mA each; where
+    # optics are bright, exposures and so the lights are shorter.
     emitter_mw = counted["led_charge_nc"] * 1e-9 / (cycles / timing.CPU_HZ) * 5.0 * 1e3
     assert 0.8 * stated.emitter_mw < emitter_mw <= stated.emitter_mw
     asleep = counted["asleep_cycles"] / cycles
     drawn = 5.0 * (asleep * power.IDLE_MA + (1 - asleep) * power.ACTIVE_MA + power.CONVERTER_MA)
-    print(setting, "asleep", asleep, "mcu", drawn, "of", stated.mcu_mw, "emitters", emitter_mw, stated.emitter_mw)
+    print(setting, "asleep", asleep, "mcu", drawn, stated.mcu_mw, "emitters", emitter_mw, stated.emitter_mw)
     assert drawn == pytest.approx(stated.mcu_mw, rel=0.1)
 
 
@@ -191,7 +192,7 @@ def test_no_storm_of_commands_lights_longer_than_eye_safety_assumes(virtual_nano
         counted = nano.control.counters()
         cycles = nano.control.time().cycle - began
     duty = [counted[f"lit_cycles_{i}"] / cycles for i in range(6)]
-    print(asked, "commands,", refused, "refused,", cycles / 16e6, "s, lit", duty, counted["longest_pulse_cycles"])
+    print(asked, "asked", refused, "refused", cycles / 16e6, "s, lit", duty, counted["longest_pulse_cycles"])
     assert refused < asked / 2 and counted["wdt_resets"] <= 1
     assert counted["longest_pulse_cycles"] <= Timing(timing.SLOT_CYCLES_MAX).lit_cycles(timing.LATE_CYCLES)
     settings = Timing(), Timing(timing.SLOT_CYCLES_MAX)

@@ -22,7 +22,7 @@ def drawn(led2gaze):
 
 
 def test_the_default_setting_by_hand(drawn):
-    # Lit 2,696 of a phase's 5,328 cycles: four LEDs of 20 mA from 5 V. 9.2 + 0.3 mA. 3.2 V over 330 ohm; 250k.
+    # Lit 2,696 of a phase's 5,328 cycles: four LEDs of 20 mA from 5 V. 9.2 + 0.3 mA. 3.2 V over 330 ohm.
     one = drawn["default"]
     assert one.lit == pytest.approx(4 * 2696 / 5328)
     assert one.emitter_mw == pytest.approx(4 * 2696 / 5328 * 100, rel=1e-9)
