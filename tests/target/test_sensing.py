@@ -33,7 +33,8 @@ def port_app(virtual_nano, any_map, port_with, repo_root, tmp_path):
 
     def start(bad="NOTHING", settle_s=BOOT_S + LOCKOUT_S + 0.1, **options):
         elf = port_with(repo_root / "tests" / "target" / "bad_app.c", f"-DBAD={bad}")
-        nano = virtual_nano(map=any_map, unpaced=True, person=1, app=elf, **options)
+        options.setdefault("map", any_map)
+        nano = virtual_nano(unpaced=True, person=1, app=elf, **options)
         link = open_link(nano.port)
         link.sleep(settle_s)
         links.append(link)
@@ -128,7 +129,7 @@ def test_lateness_in_the_reading_is_lateness_at_the_pin(port_app, bad):
     app.link.sleep(0.02)
     app.link.write(b"c\1")
     moments = app.moments(0.6)
-    stated = parse(app)
+    stated = parse(app)[3:500]
     found = samples(moments)
     # Whole cycles, told apart by their first conversion: 12 samples each, lit before unlit of each pair.
     while found and (found[0].channel != 5 or not found[0].lit):
@@ -151,12 +152,13 @@ def parse(app):
 def test_a_plan_swaps_whole(port_app):
     """While exposures change all the time, every cycle's twelve exposures are of one request."""
     app = port_app()
-    asked = [[300 + 140 * k + i for i in range(LEDS)] for k in range(10)]
+    asked = [[300 + 140 * k + i for i in range(LEDS)] for k in range(8)]
 
     def change(_):
         for exposures in asked:
             app.expose(exposures)
             app.link.sleep(0.0033)
+        app.link.sleep(0.01)
 
     found = samples(app.moments(0, change))
     while found[0].channel != 5 or not found[0].lit:
@@ -169,7 +171,7 @@ def test_a_plan_swaps_whole(port_app):
                  for s in found[k:k + 12]]
         assert len(set(cycle)) == 1, cycle
         seen.append(cycle[0])
-    assert sorted(set(seen)) == list(range(11)) and seen == sorted(seen)
+    assert sorted(set(seen)) == list(range(9)) and seen == sorted(seen)
 
 
 def test_device_time_and_exposures_hold_across_many_wraps_of_the_timer(port_app):
@@ -205,12 +207,8 @@ def test_timing_changes_begin_a_frame_and_keep_every_exposure_exact(port_app):
                    dict(frame_cycles=16_000_000 // 100), dict(period_cycles=SLOTS * 1777), dict()):
         took_timing = app.timing(**timing)
         app.link.sleep(0.05)
-        app.link.write(b"c\1")
-        app.link.sleep(0.002)
         found = samples(app.moments(0.06))[2 * LEDS:]
-        cycles = parse(app)
-        app.link.write(b"c\0")
-        app.link.sleep(0.01)
+        cycles = app.cycles(0.06)
         assert found and all(s.cycle - s.released == took[s.channel] for s in found), timing
         # Frames: `left` counts down within one seq, and every frame is whole.
         frames = {}
@@ -265,7 +263,7 @@ def test_probe_lights_one_emitter_only_and_it_does_not_sense(port_app, emitter):
 
 
 def test_photodiodes_have_emitters_on_their_own_pins(port_app, repo_root):
-    app = port_app(headset=repo_root / "headsets" / "photodiodes.toml")
+    app = port_app(headset=repo_root / "headsets" / "nextgaze_nano.toml", map=False)
     assert app.timing(wiring=lib.SG_WIRING_PHOTODIODES).wiring == lib.SG_WIRING_PHOTODIODES
     took = app.expose(most(SLOT, PHOTODIODE_PAIRS))
     app.link.sleep(0.02)

@@ -109,7 +109,7 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "brne 3f" "\n\t"
         "cpi r24, %[soon]" "\n\t"
         "brlo sense_soon" "\n\t"
-        "rjmp sense_exit" "\n"
+        "rjmp sense_leave" "\n"                // the line can wait
         "3:" "\t"
         "cpi r25, %[cycles] + 1" "\n\t"
         "brsh sense_due" "\n"
@@ -138,7 +138,8 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "ldi r24, 0" "\n"
         "4:" "\t" "sts %[tail], r24" "\n\t"
         "rjmp sense_exit" "\n"
-        "5:" "\t"
+        "5:" "\n"
+        "sense_leave:" "\t"
         "ldi r24, %[end]" "\n\t"
         "out %[mark], r24" "\n\t"
         "pop r27" "\n\t"
@@ -286,8 +287,17 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
     __asm__ volatile(
         "sense_complete:" "\t"                  // Z behind the last code, r24 and r25 free
         "push r28" "\n\t"
+        "push r29" "\n\t"
         "lds r24, %[trigger]" "\n\t"
         "lds r25, %[trigger]+1" "\n\t"
+        "lds r28, %[slot]" "\n\t"              // armed first: this takes long
+        "lds r29, %[slot]+1" "\n\t"
+        "add r28, r24" "\n\t"
+        "adc r29, r25" "\n\t"
+        "sts %[trigger]+1, r29" "\n\t"
+        "sts %[trigger], r28" "\n\t"
+        "ldi r28, 1 << %[matched]" "\n\t"
+        "out %[flags], r28" "\n\t"
         "st Z+, r24" "\n\t"
         "st Z+, r25" "\n\t"
         "lds r28, %[base]" "\n\t"
@@ -325,7 +335,8 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "st Z+, r25" "\n\t"                    // plan
         "lds r24, %[turn]" "\n\t"
         "st Z+, r24" "\n\t"
-        : : [trigger] "i"(_SFR_MEM_ADDR(OCR1BL)), [base] "i"(&sense_base), [wraps] "i"(&sense_wraps),
+        : : [trigger] "i"(_SFR_MEM_ADDR(OCR1BL)), [slot] "i"(&sense_slot), [matched] "I"(OCF1B),
+          [flags] "I"(_SFR_IO_ADDR(TIFR1)), [base] "i"(&sense_base), [wraps] "i"(&sense_wraps),
           [current] "i"(&sense_current), [list_low] "I"(_SFR_IO_ADDR(OCR0A)), [list_high] "I"(_SFR_IO_ADDR(OCR0B)),
           [plan] "i"(sense_plan), [plan_bytes] "i"(sizeof(struct plan)), [drop] "i"(&sense_drop),
           [turn] "i"(&sense_turn));
@@ -371,16 +382,17 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "ldi r24, %[ground]" "\n\t"
         "st Z, r24" "\n"
         "3:" "\t"
-        "pop r28" "\n\t"
-        "rjmp sense_arm" "\n"
+        "rjmp 4f" "\n"
         "sense_dropped:" "\t"
         "ldi r24, 0" "\n\t"
         "sts %[drop], r24" "\n\t"
         "sbiw r30, %[back]" "\n\t"
         "sts %[out], r30" "\n\t"
-        "sts %[out]+1, r31" "\n\t"
+        "sts %[out]+1, r31" "\n"
+        "4:" "\t"
+        "pop r29" "\n\t"
         "pop r28" "\n\t"
-        "rjmp sense_arm" "\n\t"
+        "rjmp sense_then" "\n\t"
         : : [seq] "i"(&sense_seq), [left] "i"(&sense_left), [last] "i"(&sense_last), [pause] "i"(&sense_pause),
           [gap] "i"(sense_gap), [list_next] "i"(&sense_list_next), [out] "i"(&sense_out), [done] "i"(&sense_done),
           [moment] "I"(_SFR_IO_ADDR(GPIOR1)), [first] "i"(&sense_first), [ground] "M"(ADMUX_GROUND), [drop] "i"(&sense_drop),
