@@ -28,8 +28,8 @@ enum sense_cycles {
     SERVICE_AT = 40,                // compare match of a service after its slot's trigger, at the earliest
     SERVICE_LATEST = 388,           // from its slot's trigger to the first release it follows, at most
     HOLD_AT = SAMPLE_CYCLES - 40,   // of the first event after a half's samples; it acts 43 cycles later at the earliest
-    RELEASE_LEAD_CYCLES = 104,      // 76 without any other interrupt in the way
-    LIGHT_LEAD_CYCLES = 112,
+    RELEASE_LEAD_CYCLES = 98,       // 76 when nothing is in the way
+    LIGHT_LEAD_CYCLES = 113,
     HOLD_CYCLES = 166,              // from the first event's match, a service, to a release's, so that that is not late
     SPACING_CYCLES = 200,           // the same of the others: the one that completes a cycle takes longer
     WITH_RELEASE_CYCLES = 20,       // from SERVICE_AT to a release that the service can follow without an interrupt
@@ -95,6 +95,7 @@ extern uint8_t sense_drop;                      // there is no cycle before this
 extern uint8_t sense_pause;                     // frames end with a pause
 extern volatile uint8_t sense_current;                   // index of the running cycle's plan
 extern uint8_t *sense_first;                    // ADMUX of slot 0 to be set back to GND; NULL: it is
+extern volatile uint8_t sense_pauses;           // changes when sense_base does without sense_done
 extern volatile uint8_t sense_done;             // cycles complete, low byte
 
 // Called by the interrupt, seldom. OCR1A is the match it was called at.

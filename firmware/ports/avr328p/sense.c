@@ -43,7 +43,7 @@ uint8_t sense_turn;
 volatile uint8_t sense_current;
 volatile uint8_t sense_done;
 
-static volatile uint8_t alive;
+volatile uint8_t sense_pauses;
 static volatile uint8_t plan_next;          // index of the plan to begin with, or to go on with
 static volatile uint8_t restart;            // timing changed: begin a frame with it
 static uint8_t pausing;
@@ -86,7 +86,7 @@ static void base_at(uint16_t ticks)
 
 uint8_t sense_alive(void)
 {
-    return sense_done + alive;
+    return sense_done + sense_pauses;
 }
 
 static uint16_t ticks_now(void)
@@ -200,7 +200,7 @@ const uint8_t *sense_wait(void)
 {
     const uint16_t match = OCR1A;
     base_at(match);
-    alive++;
+    sense_pauses++;
     sei();
     if (!pausing) {
         pausing = 1;
@@ -227,7 +227,7 @@ const uint8_t *sense_give_up(void)
 {
     const uint16_t given_up = TCNT1;
     base_at(given_up);
-    alive++;
+    sense_pauses++;
     TIFR1 = 1 << OCF1A;
     sei();
     late_slots++;

@@ -384,6 +384,9 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "3:" "\t"
         "rjmp 4f" "\n"
         "sense_dropped:" "\t"
+        "lds r24, %[turns]" "\n\t"
+        "inc r24" "\n\t"
+        "sts %[turns], r24" "\n\t"
         "ldi r24, 0" "\n\t"
         "sts %[drop], r24" "\n\t"
         "sbiw r30, %[back]" "\n\t"
@@ -395,7 +398,7 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "rjmp sense_then" "\n\t"
         : : [seq] "i"(&sense_seq), [left] "i"(&sense_left), [last] "i"(&sense_last), [pause] "i"(&sense_pause),
           [gap] "i"(sense_gap), [list_next] "i"(&sense_list_next), [out] "i"(&sense_out), [done] "i"(&sense_done),
-          [moment] "I"(_SFR_IO_ADDR(GPIOR1)), [first] "i"(&sense_first), [ground] "M"(ADMUX_GROUND), [drop] "i"(&sense_drop),
+          [moment] "I"(_SFR_IO_ADDR(GPIOR1)), [first] "i"(&sense_first), [ground] "M"(ADMUX_GROUND), [drop] "i"(&sense_drop), [turns] "i"(&sense_pauses),
           [back] "M"(offsetof(struct taken, wraps)));
     __asm__ volatile(
         "sense_special:" "\t"
