@@ -19,7 +19,7 @@ CORE = {
     "sg_model": {"sg_err", "sg_q", "sg_rom", "sg_crc32_table"}, "sg_crc32_table": {"sg_rom"},
     "sg_light": {"sg_rom", "sg_light_loop", "sg_light_table"},
     "sg_light_loop": {"sg_rom", "sg_light", "sg_light_table"}, "sg_light_table": {"sg_light_loop", "sg_rom"},
-    "sg_light_avr": set(),
+    "sg_light_avr": {"sg_light_table"},
     "sg_expose": set(), "sg_health": set(),
     "sg_link": {"sg_err", "sg_wire"},
     "sg_gp": {"sg_err", "sg_q", "sg_rom", "sg_model", "sg_gp_loop"},

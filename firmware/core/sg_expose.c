@@ -108,6 +108,13 @@ static uint8_t acquire(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
     return 0;
 }
 
+// An exposure for the ambient light of late and this signal, / 4.
+static uint8_t choose(struct sg_expose_led *led, uint8_t signal_q2)
+{
+    const uint16_t now = wanted(led, (uint16_t)(led->unlit_peak << 2), (uint16_t)(signal_q2 << 2));
+    return change(led, now, SG_EXPOSE_VERIFY);
+}
+
 // The exposure in force, looked at once a round. Returns 1 if it changed.
 static uint8_t look(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
 {
@@ -122,7 +129,7 @@ static uint8_t look(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
     if (led->stage == SG_EXPOSE_WATCH) {
         if (++led->streak < WATCH_LOOKS)
             return 0;
-        return change(led, wanted(led, (uint16_t)(led->unlit_peak << 2), (uint16_t)(signal_q2 << 2)), SG_EXPOSE_VERIFY);
+        return choose(led, signal_q2);
     }
     if (led->stage == SG_EXPOSE_VERIFY) {
         led->unlit_then = led->unlit_peak;
@@ -135,8 +142,7 @@ static uint8_t look(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
     const uint8_t risen = load_then_q2 > BRIGHT_Q2 && led->unlit_peak > led->unlit_then + RISEN_Q2;
     const uint8_t freed = longer && led->unlit_then > led->unlit_peak + FREED_Q2;
     if (risen || freed)
-        return change(led, wanted(led, (uint16_t)(led->unlit_peak << 2), (uint16_t)(led->signal_then << 2)),
-                      SG_EXPOSE_VERIFY);
+        return choose(led, led->signal_then);
     // What our own light did must last.
     if (lit > SG_EXPOSE_BRIGHT_CODE)
         led->streak = (int8_t)(led->streak > 0 ? led->streak + 1 : 1);
@@ -147,7 +153,7 @@ static uint8_t look(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
         led->streak = 0;
     if (led->streak < SG_EXPOSE_PATIENCE_BRIGHT && led->streak > -SG_EXPOSE_PATIENCE_DIM)
         return 0;
-    return change(led, wanted(led, (uint16_t)(led->unlit_peak << 2), (uint16_t)(signal_q2 << 2)), SG_EXPOSE_VERIFY);
+    return choose(led, signal_q2);
 }
 
 // Has the light around fallen away? Looks in consecutive cycles, each at another sensor, say so. Then all exposures
@@ -203,21 +209,30 @@ static void forget_caution(struct sg_expose *expose)
     }
 }
 
+// Bit 10 is set from SG_EXPOSE_SATURATED_CODE on.
+static inline uint8_t raised(uint16_t code)
+{
+    return (uint8_t)((uint16_t)(code + (1024U - SG_EXPOSE_SATURATED_CODE)) >> 8);
+}
+
 uint8_t sg_expose_cycle(struct sg_expose *expose, const uint16_t lit_code[6], const uint16_t unlit_code[6],
                         const uint16_t exposure_cycles[6])
 {
-    uint8_t urgent = expose->acquiring;
-    for (uint8_t i = 0; i < CHANNELS; i++)
-        urgent |= lit_code[i] >= SG_EXPOSE_SATURATED_CODE;
+    const uint8_t any = raised(lit_code[0]) | raised(lit_code[1]) | raised(lit_code[2]) | raised(lit_code[3])
+                      | raised(lit_code[4]) | raised(lit_code[5]);
     uint8_t changed = 0;
-    if (urgent)
+    if ((any & 4U) || expose->acquiring)
         changed = at_once(expose, lit_code, unlit_code, exposure_cycles);
 
-    const uint8_t next = expose->next;
+    uint8_t next = expose->next;
+    if (next == 0) {
+        next = CHANNELS;
+        if (++expose->rounds >= SLOW_ROUNDS)
+            forget_caution(expose);
+    }
+    next--;
+    expose->next = next;
     struct sg_expose_led *led = &expose->led[next];
-    expose->next = next < CHANNELS - 1U ? (uint8_t)(next + 1U) : 0;
-    if (next == 0 && ++expose->rounds >= SLOW_ROUNDS)
-        forget_caution(expose);
     const uint16_t lit = lit_code[next], unlit = unlit_code[next];
     if (led->stage < SG_EXPOSE_VERIFY || exposure_cycles[next] != led->exposure_cycles || is_full(lit, unlit))
         return changed;

@@ -39,6 +39,7 @@ struct sg_expose_led {
     int8_t streak;              // looks in a row that were too bright (> 0) or too dim (< 0)
     uint8_t caution;            // eighths taken off the goal since exposures chosen of late were full soon after
     uint8_t age;                // looks since the exposure changed, up to 255
+    uint8_t reserved;
 };
 
 enum sg_expose_stage {

@@ -31,5 +31,5 @@ void sg_light_curve(struct sg_light *light, const int8_t curve_q10[6], int8_t ze
 
 void sg_light_gap(struct sg_light *light)
 {
-    light->fresh |= SG_LIGHT_FRESH_GAP;
+    light->state |= SG_LIGHT_GAP;
 }

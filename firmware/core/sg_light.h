@@ -49,7 +49,7 @@ struct sg_light_channel {
     uint16_t unlit_q5[2];           // of the previous cycle and of the one before it, while ambient light moves
     uint16_t mean_q5;               // of unlit codes
     int16_t slope_q16;              // 2 k1 and the channel's curve
-    uint8_t settled;                // cycles with this exposure, up to 16
+    uint8_t settled;                // cycles with this exposure, up to 16: until then the mean follows by a quarter
     uint8_t cycles;                 // added since the last features
     uint8_t flags;                  // bits of enum sg_light_flag: of the cycles added; after sg_light_features its own
     uint8_t reserved;
@@ -60,8 +60,8 @@ struct sg_light {
     uint8_t before_q8;              // b of above
     uint8_t earlier_q8;             // -c
     uint16_t moving;                // mean square of the sum of the unlit codes' departures, 1/64 code^2
-    uint8_t wiring;                 // enum sg_wiring
-    uint8_t fresh;                  // earlier unlit codes are none: 1 after a gap, 2 as ambient light begins to move
+    uint8_t wiring;                 // enum sg_wiring: 0 or 1
+    uint8_t state;                  // bits: 1 a gap came before, 2 ambient light begins to move, 4 it moves
     int8_t zero_q5;                 // the least that a mean unlit code can mean, 0 or less
     uint8_t dither;                 // 0..15: a mean must not stop short of what it follows
 };

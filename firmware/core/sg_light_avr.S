@@ -23,7 +23,7 @@
 #define LIGHT_EARLIER 1
 #define LIGHT_MOVING 2
 #define LIGHT_WIRING 4
-#define LIGHT_FRESH 5
+#define LIGHT_STATE 5
 #define LIGHT_ZERO 6
 #define LIGHT_DITHER 7
 #define READING_HELD 48
@@ -36,21 +36,27 @@
 #define PASS_LIT 2
 #define PASS_UNLIT 4
 #define PASS_DEPARTURE 6
+#define PASS_MORE 8
 #define PASS_BYTES 10
 #define SETTLED 16
-#define MOVING_FROM 768
+#define MOVING_FROM 1024         /* and MOVING_MOST: of whole 256 */
+#define RESTING_BELOW 640
 #define MOVING_MOST 4096
 #define DEPARTURE_MOST 63
-#define FRESH_MOVING 2
+#define GAP_OR_BEGINS 3
+#define BEGINS 2
+#define MOVES 4
+#define MOVES_BIT 2
+#define SATURATED 8
+#define STARVED 16
 #define FULL_HIGH 0x7D          /* of 1000 codes, 1/32 */
 #define STEP 112
 #define CLIPPED 40
-#define CALM_HIGH 0x60          /* below, an interpolated code fits 15 bits */
 #define LEAP_HIGH 4
 #define LEAST_LOW 128           /* of what is not starved */
 
 #define zero r2
-#define unit r3                 /* 32 */
+#define rail r3                 /* all bits if lit emitters lift it */
 #define lightl r4
 #define lighth r5
 #define readingl r6
@@ -65,7 +71,7 @@
 #define broughth r15
 #define dither r10              /* as it rests, in the place of the weights */
 #define floor_q5 r11
-#define moving r16              /* 0: light rests, 1: it moves, 2: in between */
+#define moving r16              /* 0: light rests */
 #define turn r17
 
 ; high:low = upper half of a:b times c:d, both signed; t is lost. a..d are of r16..r23.
@@ -88,21 +94,12 @@
 
 ; code = 32 code
 .macro to_q5 high, low
-    mul \low, unit
+    ldi r24, 32
+    mul \low, r24
     swap \high
     lsl \high
     add \high, r1
     mov \low, r0
-.endm
-
-; sum += x weight, Q0.8; weight is of r16..r23
-.macro weigh add_, adc_, sumh, suml, xh, xl, weight
-    mulsu \xh, \weight
-    \add_ \suml, r0
-    \adc_ \sumh, r1
-    mul \xl, \weight
-    \add_ \suml, r1
-    \adc_ \sumh, zero
 .endm
 
 ; ---- void sg_light_add(struct sg_light *light r25:r24, const struct sg_reading *reading r23:r22)
@@ -117,49 +114,28 @@ sg_light_add:
     movw lightl, r24
     movw readingl, r22
     clr zero
-    ldi r20, 32
-    mov unit, r20
     movw r28, r24
     subi r28, lo8(-LIGHT_BEFORE)
     sbci r29, hi8(-LIGHT_BEFORE)
-    ldd r20, Y + LIGHT_FRESH
-    tst r20
+    ldd r20, Y + LIGHT_STATE
+    andi r20, GAP_OR_BEGINS
     breq 1f
     call sg_light_prepare
-1:  ld before_w, Y
+1:  ldd moving, Y + LIGHT_STATE
+    andi moving, MOVES
+    ld before_w, Y
     ldd earlier_w, Y + LIGHT_EARLIER
-    ldd r24, Y + LIGHT_MOVING   ; a quarter of what is above MOVING_FROM: nothing, less than 256, or more
-    ldd r25, Y + LIGHT_MOVING + 1
-    ldi moving, 0
-    subi r24, lo8(MOVING_FROM)
-    sbci r25, hi8(MOVING_FROM)
-    brlo 2f
-    lsr r25
-    ror r24
-    lsr r25
-    ror r24
-    ldi moving, 1
-    tst r25
-    brne 3f
-    clr moving
-    tst r24
-    breq 3f
-    ldi moving, 2
-    rjmp 3f
-2:  clr r24
-    clr r25
-3:  cpse moving, zero
-    rjmp 4f
+    brne 2f
     ldd dither, Y + LIGHT_DITHER
     ldd floor_q5, Y + LIGHT_ZERO
-4:  push r25                    ; moving_q8
-    push r24
+2:  ldd r21, Y + LIGHT_WIRING
+    mov rail, r21
+    dec rail                    ; all bits for LEDs
     clr departl
     clr departh
-    push zero
-    push zero
-    push zero
-    push zero
+    .rept 6
+    push zero                   ; unlit_more_q5, departure, unlit_code
+    .endr
     movw r30, readingl
     ldd r24, Z + READING_HELD
     ldd r25, Z + READING_HELD + 1
@@ -178,8 +154,7 @@ sg_light_add:
     .endr
 4:  ldi r24, lo8(sg_light_order)
     ldi r25, hi8(sg_light_order)
-    ldd r20, Y + LIGHT_WIRING
-    sbrc r20, 0
+    sbrc r21, 0
     adiw r24, 6
     movw orderl, r24
     clr turn
@@ -190,7 +165,9 @@ each:
     movw orderl, r30
     brtc 1f
     rjmp other
-1:  ldi r24, CHANNEL_BYTES
+1:
+ordinary:
+    ldi r24, CHANNEL_BYTES
     mul r26, r24
     movw r28, r0
     add r28, lightl
@@ -207,14 +184,16 @@ each:
     ldd r24, Z + READING_EXPOSURE
     ldd r25, Y + CHANNEL_EXPOSURE
     cp r24, r25
-    brne 2f
+    brne fresh
     ldd r24, Z + READING_EXPOSURE + 1
     ldd r25, Y + CHANNEL_EXPOSURE + 1
     cp r24, r25
-    brne 2f
-    ldd r24, Y + CHANNEL_SETTLED
-    cpi r24, SETTLED
-    brne 2f
+    brne fresh
+    ldd r24, Y + CHANNEL_CYCLES
+    cpse r24, zero
+    rjmp 1f
+    std Y + CHANNEL_FLAGS, zero
+1:
     ldd r18, Z + READING_LIT
     ldd r19, Z + READING_LIT + 1
     ldd r20, Z + READING_UNLIT
@@ -222,16 +201,19 @@ each:
     to_q5 r19, r18
     to_q5 r21, r20
     cpi r19, FULL_HIGH
-    brsh 2f
+    brsh full
     cpi r21, FULL_HIGH
-    brsh 2f
+    brsh full
+known:
     ldd r22, Y + CHANNEL_MEAN
     ldd r23, Y + CHANNEL_MEAN + 1
     movw r24, r20
     sub r24, r22                ; departure from the mean
     sbc r25, r23
     tst moving
-    brne moves
+    breq 1f
+    rjmp moves
+1:
 
     ; light that rests: within 3.5 codes of the mean
     mov r27, r24
@@ -244,7 +226,33 @@ each:
     cpi r25, 2 * STEP - 1
     brlo 3f
 2:  rjmp other
-3:  add r24, dither             ; a sixteenth of it in a byte
+
+fresh:                          ; another exposure
+    ldd r20, Z + READING_UNLIT
+    ldd r21, Z + READING_UNLIT + 1
+    ldd r22, Z + READING_EXPOSURE
+    ldd r23, Z + READING_EXPOSURE + 1
+    movw r24, r28
+    push r26
+    clr r1
+    call sg_light_begin
+    pop r26
+    clt
+    rjmp ordinary
+
+full:                           ; and nobody knows what the next of this pair gets from the sample capacitor
+    ldd r24, Y + CHANNEL_FLAGS
+    ori r24, SATURATED
+    std Y + CHANNEL_FLAGS, r24
+    in r30, 0x3D
+    in r31, 0x3E
+    std Z + 1 + PASS_MORE, zero
+    std Z + 2 + PASS_MORE, zero
+    set
+    rjmp known
+
+3:  mov r27, r24
+    add r24, dither             ; a sixteenth of it in a byte
     asr r24
     asr r24
     asr r24
@@ -254,7 +262,19 @@ each:
     sbc r25, r25
     add departl, r24
     adc departh, r25
-    add r22, r24
+    ldd r26, Y + CHANNEL_SETTLED
+    cpi r26, SETTLED
+    breq 4f
+    inc r26                     ; at first, a quarter
+    std Y + CHANNEL_SETTLED, r26
+    subi r27, -2
+    asr r27
+    asr r27
+    mov r24, r27
+    mov r25, r24
+    lsl r25
+    sbc r25, r25
+4:  add r22, r24
     adc r23, r25
     std Y + CHANNEL_MEAN, r22
     std Y + CHANNEL_MEAN + 1, r23
@@ -277,10 +297,6 @@ meant_near:
     rjmp meant
 
 moves:
-    cpi moving, 2
-    breq 2b
-    cpi r21, CALM_HIGH
-    brsh 2b
     ldd r22, Y + CHANNEL_UNLIT
     ldd r23, Y + CHANNEL_UNLIT + 1
     sub r22, r20                ; before - now
@@ -302,14 +318,28 @@ moves:
     ror r0
     cp r30, r0
     cpc r31, r1
-    brsh 2b
-5:  adiw r24, 8
+    brlo 5f
+    rjmp other
+5:  movw r30, r24
+    adiw r24, 8
     .rept 4
     asr r25
     ror r24
     .endr
     add departl, r24
     adc departh, r25
+    ldd r26, Y + CHANNEL_SETTLED
+    cpi r26, SETTLED
+    breq 4f
+    inc r26
+    std Y + CHANNEL_SETTLED, r26
+    movw r24, r30
+    adiw r24, 2
+    asr r25
+    ror r24
+    asr r25
+    ror r24
+4:
     ldd r30, Y + CHANNEL_MEAN
     ldd r31, Y + CHANNEL_MEAN + 1
     add r30, r24
@@ -327,19 +357,38 @@ moves:
     std Y + CHANNEL_EARLIER + 1, r25
     std Y + CHANNEL_UNLIT, r20
     std Y + CHANNEL_UNLIT + 1, r21
-    movw r24, r20
+    movw r26, r20
     mov r20, before_w
-    weigh add, adc, r25, r24, r23, r22, r20
+    mulsu r23, r20              ; Q0.8
+    movw r24, r0
+    mul r22, r20
+    add r24, r1
+    adc r25, zero
     movw r22, r30
     mov r20, earlier_w
-    weigh sub, sbc, r25, r24, r23, r22, r20
-    movw r22, r24
-    tst r23
+    mulsu r23, r20
+    sub r24, r0
+    sbc r25, r1
+    mul r22, r20
+    sub r24, r1
+    sbc r25, zero
+    movw r22, r26
+    add r22, r24
+    adc r23, r25
+    brvs 6f
     brpl meant
     clr r22
     clr r23
+    rjmp meant
+6:  ldi r22, 0xFF               ; beyond 15 bits
+    ldi r23, 0x7F
 
 meant:                          ; r19:r18 lit, r23:r22 unlit as meant
+    mov r27, r19                ; less what the rail does
+    lsr r27
+    and r27, rail
+    sub r18, r27
+    sbc r19, zero
     movw r24, r18
     add r24, r22                ; their sum, unsigned
     adc r25, r23
@@ -381,7 +430,9 @@ meant:                          ; r19:r18 lit, r23:r22 unlit as meant
     upper_signed r31, r30, r23, r22, r21, r20, r26
     sub r24, r30
     sbc r25, r31
-7:  movw broughtl, r18
+7:  movw broughtl, r18          ; for the next, with what the rail did
+    add broughtl, r27
+    adc broughth, zero
     clr r20                     ; the signal, 32 bits
     add r18, r24
     adc r19, r25
@@ -390,10 +441,8 @@ meant:                          ; r19:r18 lit, r23:r22 unlit as meant
 8:  mov r21, r20
     ldd r24, Y + CHANNEL_CYCLES
     tst r24
-    brne 8f
-    std Y + CHANNEL_FLAGS, zero
-    rjmp 9f
-8:  cpi r24, 255
+    breq 9f
+    cpi r24, 255
     breq next
     ldd r25, Y + CHANNEL_SUM
     add r18, r25
@@ -460,17 +509,19 @@ next:
     subi r20, -7
     andi r20, 15
     std Y + LIGHT_DITHER, r20
-    ldi r20, lo8(MOVING_FROM)
-    ldi r21, hi8(MOVING_FROM)
-    cp r20, r24                 ; above now, and not above before?
-    cpc r21, r25
-    brsh 7f
-    cp r20, r22
-    cpc r21, r23
+    ldd r20, Y + LIGHT_STATE
+    ldi r21, hi8(RESTING_BELOW)
+    cpi r24, lo8(RESTING_BELOW)
+    cpc r25, r21
+    brsh 8f
+    andi r20, 0xFF - MOVES
+    rjmp 9f
+8:  cpi r25, hi8(MOVING_FROM)
     brlo 7f
-    ldd r20, Y + LIGHT_FRESH
-    ori r20, FRESH_MOVING
-    std Y + LIGHT_FRESH, r20
+    sbrc r20, MOVES_BIT
+    rjmp 7f
+    ori r20, MOVES + BEGINS
+9:  std Y + LIGHT_STATE, r20
 7:  clr r1
     .irp r, 29, 28, 17, 16, 15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2
     pop r\r
@@ -491,7 +542,10 @@ other:                          ; r26: the channel, untouched so far
     breq 3f                     ; the pass holds what came before the first
     clr r22
     clr r23
-    movw r24, r22
+    brts 1f                     ; the first of this pair went the same way: its word stands
+    std Z + PASS_MORE, r22
+    std Z + PASS_MORE + 1, r22
+1:  movw r24, r22
     sbrs turn, 0
     rjmp 2f
     movw r30, orderl            ; the first of this pair
@@ -541,8 +595,10 @@ sg_light_features:
     clr r16                     ; flags
     ldi r17, 6
 1:  ldd r25, Y + CHANNEL_CYCLES
-    tst r25
-    breq 8f
+    cpse r25, r1
+    rjmp 6f
+    rjmp 8f
+6:
     cpi r25, 1
     brne 2f
     ldd r18, Y + CHANNEL_SUM
@@ -550,14 +606,22 @@ sg_light_features:
     ldd r20, Y + CHANNEL_SUM + 2
     ldd r21, Y + CHANNEL_SUM + 3
     or r20, r21
-    brne 2f
+    brne 6f
     ldi r20, 15
     tst r19
     brmi 5f
     brne 4f
     cpi r18, LEAST_LOW
     brsh 3f
-2:  movw r24, r28               ; several cycles, starved, or beyond 16 bits
+    rjmp 9f
+6:  sbrs r21, 7                 ; beyond 16 bits, or negative
+    rjmp 2f
+9:  ldd r25, Y + CHANNEL_FLAGS
+    ori r25, STARVED
+    std Y + CHANNEL_FLAGS, r25
+    ldi r18, LEAST_LOW
+    rjmp 3f
+2:  movw r24, r28               ; several cycles, or beyond 16 bits
     call sg_light_feature
     rjmp 7f
 3:  mov r19, r18

@@ -95,19 +95,18 @@ static int16_t unclipped_q5(uint16_t mean_q5, int8_t zero_q5)
 static int16_t ambient_q5(const struct sg_light *light, struct sg_light_channel *channel, uint16_t unlit_q5,
                           struct sg_light_pass *pass)
 {
+    const uint8_t moves = light->state & SG_LIGHT_MOVES;
     const int16_t off = (int16_t)(unlit_q5 - channel->mean_q5);
-    int16_t step = (int16_t)((off + (pass->moving_q8 == 0 ? light->dither : 8)) >> 4);
+    const uint8_t dither = moves ? 8 : light->dither;
+    int16_t step = (int16_t)((off + dither) >> 4);
     pass->departure = (int16_t)(pass->departure + step);
     if (channel->settled < SG_LIGHT_SETTLED) {
-        uint8_t shift = 0;
-        for (uint8_t n = channel->settled; n > 1; n >>= 1)
-            shift++;
-        step = (int16_t)(((off >> shift) + 1) >> 1);
+        step = (int16_t)((off + 2) >> 2);
         channel->settled++;
     }
     const uint16_t mean = (uint16_t)(channel->mean_q5 + step);
     channel->mean_q5 = mean;
-    if (pass->moving_q8 == 0) {
+    if (!moves) {
         if (size_of(off) < SG_LIGHT_STEP_Q5)
             return mean < SG_LIGHT_CLIPPED_Q5 ? unclipped_q5(mean, light->zero_q5) : (int16_t)mean;
         settle(channel, unlit_q5);
@@ -127,19 +126,16 @@ static int16_t ambient_q5(const struct sg_light *light, struct sg_light_channel 
             return (int16_t)unlit_q5;
         }
     }
-    int32_t meant = (int32_t)unlit_q5 + by_q8(past, light->before_q8) - by_q8(long_past, light->earlier_q8);
-    if (pass->moving_q8 < SG_LIGHT_MOVING_FULL)
-        meant = mean + (((meant - mean) * pass->moving_q8) >> 8);
+    const int32_t meant = (int32_t)unlit_q5 + by_q8(past, light->before_q8) - by_q8(long_past, light->earlier_q8);
     return meant < 0 ? 0 : meant > INT16_MAX ? INT16_MAX : (int16_t)meant;
 }
 
-// A channel's first cycle, or its first with another exposure: what it has of this frame is dropped.
-static void begin(struct sg_light_channel *channel, uint16_t exposure_cycles, uint16_t unlit_q5)
+void sg_light_begin(struct sg_light_channel *channel, uint16_t exposure_cycles, uint16_t unlit_code)
 {
     channel->exposure_cycles = exposure_cycles;
     channel->unit_q12 = (int16_t)(UNIT_Q12 - sg_light_log2_q12(exposure_cycles == 0 ? 1 : exposure_cycles));
     channel->cycles = 0;
-    settle(channel, unlit_q5);
+    settle(channel, sg_light_q5(unlit_code));
 }
 
 void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint8_t i, struct sg_light_pass *pass)
@@ -149,7 +145,7 @@ void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint
     const uint16_t lit_q5 = sg_light_q5(lit);
     uint16_t unlit_q5 = sg_light_q5(unlit);
     if (channel->exposure_cycles != reading->exposure_cycles[i])
-        begin(channel, reading->exposure_cycles[i], unlit_q5);
+        sg_light_begin(channel, reading->exposure_cycles[i], unlit);
     if (channel->cycles == 0)
         channel->flags = 0;
     // Full itself, or nobody knows what the sample capacitor brought.
@@ -157,24 +153,29 @@ void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint
         || pass->lit_code >= SG_LIGHT_SATURATED_CODE || pass->unlit_code >= SG_LIGHT_SATURATED_CODE)
         channel->flags |= SG_LIGHT_SATURATED;
     const uint8_t late_lit = reading->late_lit_cycles[i], late_unlit = reading->late_unlit_cycles[i];
-    int16_t missed = 0;
+    // A neighbour released late brought less than usual.
+    unlit_q5 = (uint16_t)(unlit_q5 + high(pass->unlit_more_q5, SHARE_Q16));
+    int16_t missed = 0, more = 0;
     if (late_lit)
         missed = missed_q5(channel, lit, pass->lit_code, late_lit);
     if (late_unlit) {
-        const int16_t more = missed_q5(channel, unlit, pass->unlit_code, late_unlit);
+        more = missed_q5(channel, unlit, pass->unlit_code, late_unlit);
         // From charge to code: over the curve's slope, 1 + 2 k1 x, of which `more` has the half.
-        unlit_q5 = (uint16_t)(unlit_q5 + more - high(more, high((int16_t)unlit_q5, TWICE_K1_Q16)));
+        more = (int16_t)(more - high(more, high((int16_t)unlit_q5, TWICE_K1_Q16)));
+        unlit_q5 = (uint16_t)(unlit_q5 + more);
     }
     const int16_t meant_q5 = ambient_q5(light, channel, unlit_q5, pass);
-    const int16_t difference = (int16_t)(lit_q5 - meant_q5);
-    const int16_t bend = bend_q5(lit_q5, (uint16_t)meant_q5, channel->slope_q16);
+    const uint16_t rail = light->wiring ? 0 : lit_q5 >> SG_LIGHT_RAIL_SHIFT;
+    const int16_t difference = (int16_t)(lit_q5 - rail - (uint16_t)meant_q5);
+    const int16_t bend = bend_q5((uint16_t)(lit_q5 - rail), (uint16_t)meant_q5, channel->slope_q16);
     const int16_t brought = high(pass->brought_q5, SHARE_Q16);
     if (channel->cycles != UINT8_MAX) {
         const int32_t signal = (int32_t)difference + (int16_t)(bend + missed - brought);
         channel->sum_q5 = channel->cycles == 0 ? signal : channel->sum_q5 + signal;
         channel->cycles++;
     }
-    pass->brought_q5 = difference;
+    pass->brought_q5 = (int16_t)(difference + (int16_t)rail);
+    pass->unlit_more_q5 = more;
     pass->lit_code = lit;
     pass->unlit_code = unlit;
 }
@@ -216,10 +217,10 @@ void sg_light_prepare(struct sg_light *light, const struct sg_reading *reading)
 {
     for (uint8_t i = 0; i < SG_LIGHT_CHANNELS; i++) {
         struct sg_light_channel *channel = &light->channel[i];
-        const uint8_t gap = light->fresh & SG_LIGHT_FRESH_GAP;
+        const uint8_t gap = light->state & SG_LIGHT_GAP;
         channel->unlit_q5[0] = channel->unlit_q5[1] = gap ? sg_light_q5(reading->unlit_code[i]) : channel->mean_q5;
     }
-    light->fresh = 0;
+    light->state &= SG_LIGHT_MOVES;
 }
 
 #ifndef SG_LIGHT_ASSEMBLY
@@ -227,15 +228,13 @@ void sg_light_add(struct sg_light *light, const struct sg_reading *reading)
 {
     struct sg_light_pass pass = { .brought_q5 = (int16_t)sg_light_q5(reading->held_code),
                                   .lit_code = reading->held_code };
-    if (light->fresh)
+    if (light->state & (SG_LIGHT_GAP | SG_LIGHT_BEGINS))
         sg_light_prepare(light, reading);
-    if (light->moving > SG_LIGHT_MOVING_FROM)
-        pass.moving_q8 = (uint16_t)(light->moving - SG_LIGHT_MOVING_FROM) >> 2;
     const uint8_t *order = sg_light_order[light->wiring];
     for (uint8_t k = 0; k < SG_LIGHT_CHANNELS; k++) {
         sg_light_one(light, reading, sg_rom_byte(order + k, SG_ROM_FLASH), &pass);
         if (k & 1U) {
-            pass.brought_q5 = 0;
+            pass.brought_q5 = pass.unlit_more_q5 = 0;
             pass.lit_code = pass.unlit_code = 0;
         }
     }
@@ -246,9 +245,11 @@ void sg_light_add(struct sg_light *light, const struct sg_reading *reading)
     uint16_t moving = (uint16_t)(light->moving - (light->moving >> 4) + (uint16_t)(size * size));
     if (moving > SG_LIGHT_MOVING_MOST)
         moving = SG_LIGHT_MOVING_MOST;
-    if (moving > SG_LIGHT_MOVING_FROM && light->moving <= SG_LIGHT_MOVING_FROM)
-        light->fresh |= SG_LIGHT_FRESH_MOVING;
     light->moving = moving;
+    if (moving < SG_LIGHT_RESTING_BELOW)
+        light->state &= (uint8_t)~SG_LIGHT_MOVES;
+    else if (moving >= SG_LIGHT_MOVING_FROM && !(light->state & SG_LIGHT_MOVES))
+        light->state |= SG_LIGHT_MOVES | SG_LIGHT_BEGINS;
     light->dither = (light->dither + 7U) & 15U;
 }
 

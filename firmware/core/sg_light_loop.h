@@ -13,13 +13,17 @@ enum {
     SG_LIGHT_SETTLED = 16,              // the mean of unlit codes follows by 1/16 from then on
     SG_LIGHT_STEP_Q5 = 112,             // 3.5 codes, 4.3 times the noise: what rested has moved
     SG_LIGHT_LEAP_Q5 = 32 * 32,         // of which nobody knows whether the lit exposure saw it
-    // Mean square of what six channels depart together: noise alone is 256.
-    SG_LIGHT_MOVING_FROM = 768,
-    SG_LIGHT_MOVING_FULL = 256,         // in sg_light_pass.moving_q8: 4 * 256 above
+    // Mean square of what six channels depart together; noise alone is 256. Interpolate from, average below:
+    SG_LIGHT_MOVING_FROM = 1024,
+    SG_LIGHT_RESTING_BELOW = 640,
     SG_LIGHT_MOVING_MOST = 4096,
     SG_LIGHT_DEPARTURE_MOST = 63,
-    SG_LIGHT_FRESH_GAP = 1,
-    SG_LIGHT_FRESH_MOVING = 2,
+    // Lit emitters lift the rail, a junction biased more holds less: of the lit code, 2^-9 (0.3 ohm, 4 emitters of
+    // 20 mA: 24 mV). Emitters of photodiodes do not flow through it.
+    SG_LIGHT_RAIL_SHIFT = 9,
+    SG_LIGHT_GAP = 1,
+    SG_LIGHT_BEGINS = 2,
+    SG_LIGHT_MOVES = 4,
     SG_LIGHT_UNIT = 32,
     SG_LIGHT_CLIPPED_Q5 = 40,
 };
@@ -30,7 +34,7 @@ struct sg_light_pass {
     uint16_t lit_code;          // as sampled right before, 0 after ground
     uint16_t unlit_code;
     int16_t departure;          // sum of the sixteenths of unlit departures from their means, 1/32 code
-    uint16_t moving_q8;         // how much of the interpolation to believe, 256 and above: all
+    int16_t unlit_more_q5;      // what a late release took from the unlit code before, 0 after ground
 };
 
 // The assembly knows these places.
@@ -41,7 +45,7 @@ _Static_assert(sizeof(struct sg_light_channel) == 20 && offsetof(struct sg_light
                && offsetof(struct sg_light_channel, flags) == 18, "channel layout");
 _Static_assert(offsetof(struct sg_light, before_q8) == 120 && offsetof(struct sg_light, earlier_q8) == 121
                && offsetof(struct sg_light, moving) == 122 && offsetof(struct sg_light, wiring) == 124
-               && offsetof(struct sg_light, fresh) == 125
+               && offsetof(struct sg_light, state) == 125
                && offsetof(struct sg_light, zero_q5) == 126 && offsetof(struct sg_light, dither) == 127, "layout");
 _Static_assert(offsetof(struct sg_reading, held_code) == 48 && offsetof(struct sg_reading, unlit_code) == 12 && offsetof(struct sg_reading, exposure_cycles) == 24
                && offsetof(struct sg_reading, late_lit_cycles) == 36
@@ -57,13 +61,16 @@ extern const uint8_t sg_light_clipped_table[SG_LIGHT_CLIPPED_Q5];
 // 4096 * log2(x), x in 1..65535: rounded, at most 1.5 off.
 uint16_t sg_light_log2_q12(uint16_t x);
 
+// Begin with another exposure: what the channel has of this frame is dropped.
+void sg_light_begin(struct sg_light_channel *channel, uint16_t exposure_cycles, uint16_t unlit_code);
+
 // Add one channel's codes.
 void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint8_t i, struct sg_light_pass *pass);
 
 // Feature of the cycles added to a channel, at least one; sets STARVED. The cycles stay.
 uint16_t sg_light_feature(struct sg_light_channel *channel);
 
-// Make up the earlier unlit codes that light->fresh says are none.
+// Make up the earlier unlit codes that light->state says are none.
 void sg_light_prepare(struct sg_light *light, const struct sg_reading *reading);
 
 // Channels in the order of sampling, by wiring, in program memory: six LEDs, or six photodiodes.
