@@ -42,10 +42,10 @@ def rounded(x):
 
 
 def exp_table():
-    """2^16 exp(-i / 128), i = 0..1536, Q0.16; the last is 0.
+    """2^16 exp(-i / 64), i = 0..768, Q0.16; the last is 0.
 
     The device goes on from a node along its tangent, with the upper byte of the level only."""
-    level = [math.floor(65536 * math.exp(-i / 128)) for i in range(1537)]
+    level = [math.floor(65536 * math.exp(-i / 64)) for i in range(769)]
     level[0] = 65535
     return level
 

@@ -44,15 +44,15 @@ struct sg_gp_point {
 //   order of the vectors does not matter, to the bit.
 //   projections: |p| <= 63 * 255 < 2^14. m: four squares of 7 bits: 16 bits.
 // Accuracy
-//   |k - 2^16 exp(-T / 2^16)| <= 3 LSB for the T of this function: floor of the level 1, of the drop 1, low byte
-//   of the level left out of the drop 2 one way; curvature 2 the other way. S2 being rounded up adds 1. Left out
+//   |k - 2^16 exp(-T / 2^16)| <= 9 LSB for the T of this function: floor of the level 1, of the drop 1, low byte
+//   of the level left out of the drop 4 one way; curvature 8 the other way. S2 being rounded up adds 1. Left out
 //   of weight * k is the product of the low bytes. So the mean is within
-//     4 * 2^-16 * sum_i |weight_i| + 2^-(weight_frac_bits + 8) * (1 + sum_i (weight_i & 255)) + 2^-8 deg
+//     10 * 2^-16 * sum_i |weight_i| + 2^-(weight_frac_bits + 8) * (1 + sum_i (weight_i & 255)) + 2^-8 deg
 //   of the real-number mean at the same s and half_c2 (the second term is one-sided and mostly a constant, which
 //   the fit on the device's own arithmetic absorbs). tests/unit/test_core_gp.py asserts the bound and prints it
 //   beside the worst error seen.
 // Cost       O(n d), the same for every input but for 8 cycles (flags). tests/budget.csv; on AVR with the assembly
-//             about 2970 + 149 n cycles with sg_track around it.
+//             about 2970 + 157 n cycles with sg_track around it.
 // Returns    SG_OK, or SG_E_RANGE if an angle saturated (deg_q7 then holds the saturated value).
 int sg_gp_predict(const struct sg_model_view *view, const uint16_t feature[6], struct sg_gp_point *point);
 // cdef end

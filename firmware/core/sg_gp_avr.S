@@ -108,14 +108,23 @@
 2:
     movw r26, r30
     movw r30, t1
-    andi r30, 0xFE              ; 2 * (T >> 9)
+    lsr r31
+    ror r30
+    andi r30, 0xFE              ; 2 * (T >> 10)
     subi r30, lo8(-(sg_gp_exp_table))
     sbci r31, hi8(-(sg_gp_exp_table))
     lsr t1
-    ror t0                      ; fraction (T >> 1) & 255
+    ror t0
+    lsr t1
+    ror t0                      ; fraction (T >> 2) & 255
     lpm t1, Z+                  ; level Q0.16
     lpm t2, Z
-    fmul t2, t0                 ; carry:r1 = (level >> 8) * fraction >> 7
+    fmul t2, t0                 ; (level >> 8) * fraction >> 6: bit 9 in the carry
+    brcc 4f                     ; as long as the instruction it jumps over
+    subi t2, 2
+4:
+    lsl r0
+    rol r1                      ; bit 8 in the carry, the rest in r1
     sbc t2, zero
     sub t1, r1
     sbc t2, zero

@@ -12,12 +12,12 @@
 // 2^16 exp(-t / 2^16), t in 20.4, below 2^23.
 static inline uint16_t kernel_q16(uint32_t t)
 {
-    uint16_t index = (uint16_t)(t >> 8) >> 1;  // 23 bits: whole bytes first, they cost nothing
-    if (index >= 1536U)
-        index = 1536U;  // where the table holds a zero
+    uint16_t index = (uint16_t)(t >> 8) >> 2;  // 23 bits: whole bytes first, they cost nothing
+    if (index >= 768U)
+        index = 768U;   // where the table holds a zero
     const uint16_t level_q16 = sg_rom_word(&sg_gp_exp_table[index]);
-    const uint8_t fraction_q8 = (uint8_t)((uint16_t)t >> 1);
-    return (uint16_t)(level_q16 - ((uint16_t)((uint16_t)(level_q16 >> 8) * fraction_q8) >> 7));
+    const uint8_t fraction_q8 = (uint8_t)((uint16_t)t >> 2);
+    return (uint16_t)(level_q16 - ((uint16_t)((uint16_t)(level_q16 >> 8) * fraction_q8) >> 6));
 }
 
 // weight * k without the product of the low bytes, which leaves a multiple of 256.

@@ -7,8 +7,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
-// 2^16 exp(-(i / 128)) for i = T >> 9, Q0.16; zeros from 1420 on. See make_tables.py.
-enum { SG_GP_EXP_ENTRIES = 1537 };
+// 2^16 exp(-(i / 64)) for i = T >> 10, Q0.16; zeros from 710 on. See make_tables.py.
+enum { SG_GP_EXP_ENTRIES = 769 };
 extern const uint16_t sg_gp_exp_table[SG_GP_EXP_ENTRIES];
 
 struct sg_gp_sum {

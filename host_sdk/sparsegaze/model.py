@@ -32,7 +32,7 @@ KERNEL_RBF = 0
 S_MAX = 4095  # largest input, u8.4
 S_FRAC = 16  # input steps per centre step
 U_STEPS = 64.0  # centre steps per length scale: T >> 16 then counts e-folds
-TABLE_END = 1536  # of T >> 9: the kernel is 0 from here on
+TABLE_END = 768  # of T >> 10: the kernel is 0 from here on
 
 FLAG_VALID, FLAG_NO_MODEL, FLAG_OUT_OF_RANGE = 1, 2, 4
 FLAG_SATURATED, FLAG_STARVED = 8, 16
@@ -247,8 +247,8 @@ def half_squares(centres):
 
 
 def kernel_table():
-    """The kernel's table over T >> 9, int64 [TABLE_END + 1]; it ends in zeros."""
-    level = np.floor(65536.0 * np.exp(-np.arange(TABLE_END + 1) / 128.0)).astype(np.int64)
+    """The kernel's table over T >> 10, int64 [TABLE_END + 1]; it ends in zeros."""
+    level = np.floor(65536.0 * np.exp(-np.arange(TABLE_END + 1) / 64.0)).astype(np.int64)
     return np.minimum(level, 65535)
 
 
@@ -264,8 +264,8 @@ def kernel_q16(s, centres):
     # Exact in float64: every product is below 2^20 and every sum below 2^24.
     cross = (s.astype(float) @ centres.T.astype(float)).astype(np.int64)
     t = ((np.sum(s * s, axis=1) + 31) >> 5)[:, None] + 256 * half_squares(centres) - cross
-    level = _LEVEL[np.minimum(t >> 9, TABLE_END)]
-    return level - ((level >> 8) * (t >> 1 & 255) >> 7)
+    level = _LEVEL[np.minimum(t >> 10, TABLE_END)]
+    return level - ((level >> 8) * (t >> 2 & 255) >> 6)
 
 
 def weighed(k, weights):

@@ -10,7 +10,7 @@ import numpy as np
 from sparsegaze._core import ffi, lib
 
 U = 64.0
-LEVEL = np.array([min(65535, math.floor(65536 * math.exp(-i / 128))) for i in range(1537)], np.int64)
+LEVEL = np.array([min(65535, math.floor(65536 * math.exp(-i / 64))) for i in range(769)], np.int64)
 
 
 @dataclass
@@ -116,8 +116,8 @@ def kernel(parts, s):
     """k int64 [count, n] at s."""
     t = (((s * s).sum(axis=1) + 31) >> 5)[:, None] + 256 * parts.half_c2 - s @ parts.centre.T.astype(np.int64)
     assert (t >= 0).all()
-    level = LEVEL[np.minimum(t >> 9, 1536)]
-    return level - (((level >> 8) * ((t >> 1) & 255)) >> 7)
+    level = LEVEL[np.minimum(t >> 10, 768)]
+    return level - (((level >> 8) * ((t >> 2) & 255)) >> 6)
 
 
 def twin(parts, feature):
@@ -176,7 +176,7 @@ def bound_deg(parts):
     """The error bound that sg_gp.h states, degrees [2]."""
     weights = np.abs(parts.weight).sum(axis=0) * 2.0 ** -parts.weight_frac_bits
     left_out = (parts.weight & 255).sum(axis=0) * 2.0 ** -(parts.weight_frac_bits + 8)
-    return 4.0 * 2.0 ** -16 * weights + left_out + 2.0 ** -(parts.weight_frac_bits + 8) + 2.0 ** -8
+    return 10.0 * 2.0 ** -16 * weights + left_out + 2.0 ** -(parts.weight_frac_bits + 8) + 2.0 ** -8
 
 
 class View:

@@ -12,10 +12,10 @@ from sparsegaze import _core_build
 from test_core_gp import GOLDEN_CRC, golden_crc
 
 FAULTS = {
-    "the shift of the interpolated drop": ("sg_gp_loop.c", "fraction_q8) >> 7)", "fraction_q8) >> 8)"),
+    "the shift of the interpolated drop": ("sg_gp_loop.c", "fraction_q8) >> 6)", "fraction_q8) >> 7)"),
     "the sign of a weight": ("sg_gp_loop.c", "sum->acc[1] = acc_elevation >> 8;",
                              "sum->acc[1] = (0U - acc_elevation) >> 8;"),
-    "the kernel's end": ("sg_gp_loop.c", "index >= 1536U", "index >= 700U"),
+    "the kernel's end": ("sg_gp_loop.c", "index >= 768U", "index >= 350U"),
     "the scale of S2": ("sg_gp_loop.c", "squares >> 5", "squares >> 4"),
     "the product of the low bytes": ("sg_gp_loop.c", "* k_q16 - low", "* k_q16"),
     "the rounding": ("sg_gp_loop.c", "((acc >> 8) + 2) >> 2", "acc >> 10"),
