@@ -35,6 +35,7 @@ struct app_state {
     uint16_t feature[HAL_CHANNELS];     // of the last frame
     uint16_t slot_bytes;
     uint8_t stream;                     // bits of enum sg_stream
+    uint8_t exposure_auto;              // stored when exposures are
     uint8_t slow_line;                  // 500 kbaud
     uint8_t probe;                      // the only emitter, or APP_NO_PROBE
     uint8_t sensed;                     // a cycle has come

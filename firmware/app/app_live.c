@@ -37,6 +37,7 @@ SELDOM void app_live_start(void)
         app_live.lights = 1;
         app_live.version = RECORD_VERSION;
     }
+    app.exposure_auto = app_live.exposure_auto;
     app_live.boots++;
     dirty = 1;
 }
@@ -66,6 +67,7 @@ SELDOM static void keep_exposures(void)
 {
     for (uint8_t i = 0; i < HAL_CHANNELS; i++)
         app_live.exposure_cycles[i] = app.expose.led[i].exposure_cycles;
+    app_live.exposure_auto = app.exposure_auto;
     dirty = 1;
 }
 

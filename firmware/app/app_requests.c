@@ -66,7 +66,7 @@ SELDOM static void status(struct sg_status *out)
     const uint16_t bad = app.link.bad_crc + app.link.bad_length;
     out->rx_bad = bad < app.link.bad_crc ? UINT16_MAX : bad;
     out->stream = app.stream;
-    out->exposure_auto = app_live.exposure_auto;
+    out->exposure_auto = app.exposure_auto;
     out->active = app_model_slot();
     out->alarm |= app_alarm();
 }
@@ -78,7 +78,7 @@ SELDOM static int8_t exposure(struct sg_exposure *io)
     app_expose_by(io->op, io->exposure_us_q4);
     for (uint8_t i = 0; i < HAL_CHANNELS; i++)
         io->exposure_us_q4[i] = app.expose.led[i].exposure_cycles;
-    io->op = app_live.exposure_auto ? SG_EXPOSURE_AUTO : SG_EXPOSURE_HOLD;
+    io->op = app.exposure_auto ? SG_EXPOSURE_AUTO : SG_EXPOSURE_HOLD;
     io->reserved = 0;
     return SG_OK;
 }

@@ -61,7 +61,7 @@ SELDOM static void expose_at(const uint16_t exposure_cycles[HAL_CHANNELS])
     uint16_t most[HAL_CHANNELS];
     for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
         most[i] = hal_exposure_most(i);
-        if (app_live.exposure_auto && most[i] > app_live.limit_cycles[i])
+        if (app.exposure_auto && most[i] > app_live.limit_cycles[i])
             most[i] = app_live.limit_cycles[i];
     }
     sg_expose_start(&app.expose, exposure_cycles, most);
@@ -127,7 +127,7 @@ SELDOM void app_expose_by(uint8_t op, const uint16_t exposure_us_q4[HAL_CHANNELS
         cycles[i] = sg_expose_from_us_q4(exposure_us_q4[i]);
     switch (op) {
     case SG_EXPOSURE_SET:
-        app_live.exposure_auto = 0;
+        app.exposure_auto = 0;
         expose_at(cycles);
         break;
     case SG_EXPOSURE_LIMIT:
@@ -135,7 +135,7 @@ SELDOM void app_expose_by(uint8_t op, const uint16_t exposure_us_q4[HAL_CHANNELS
         expose_again();
         break;
     default:
-        app_live.exposure_auto = op == SG_EXPOSURE_AUTO;
+        app.exposure_auto = op == SG_EXPOSURE_AUTO;
         expose_again();
     }
     app_live_exposed(op == SG_EXPOSURE_SET);
@@ -180,7 +180,7 @@ void app_sense_cycle(const struct hal_cycle *cycle)
     // One or the other: what a cycle takes at most counts.
     if (health)
         look_at(reading);
-    else if (app_live.exposure_auto
+    else if (app.exposure_auto
              && sg_expose_cycle(&app.expose, reading->lit_code, reading->unlit_code, reading->exposure_cycles))
         exposures_moved();
 }
