@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write README.md's result tables from what `make demo`, `make bench-sim` and `make bench-inference` measured.
+"""Write README.md's result tables from what `make demo` and the benchmarks measured.
 
     python tools/report.py             rewrite the demo's table, between its two markers
     python tools/report.py sim         the simulator's
     python tools/report.py inference   the inference's
+    python tools/report.py frontend    the front end's
     python tools/report.py --check     exit 1 when the README's table is not what the report says
 """
 import argparse
@@ -100,12 +101,25 @@ def inference_table(report):
     return "\n".join(lines)
 
 
+def frontend_table(report):
+    """The Markdown table of frontend.json: every bar and aim with what was measured on the worst seed."""
+    lines = [f"| simulated persons {report['seeds'][0]} to {report['seeds'][-1]}, the worst of them; * the default setting "
+             "| measured | wanted | met |", "|---|---|---|---|"]
+    for row in report["bars"]:
+        value = "-" if row["value"] is None else figure(row["value"])
+        lines.append(f"| {row['name'].replace('*', chr(92) + '*')} | {value} | {row['kind']} {row['limit']} | {'yes' if row['met'] else '**no**'} |")
+    return "\n".join(lines)
+
+
 SIM_BEGIN = "<!-- simulator: written by tools/report.py from build/bench/sim.json -->"
 SIM_END = "<!-- /simulator -->"
 INFERENCE_BEGIN = "<!-- inference: written by tools/report.py from build/bench/inference.json -->"
 INFERENCE_END = "<!-- /inference -->"
+FRONTEND_BEGIN = "<!-- frontend: written by tools/report.py from build/bench/frontend.json -->"
+FRONTEND_END = "<!-- /frontend -->"
 KINDS = {
     "demo": (Path("build/demo/report.json"), BEGIN, END, table, "make demo"),
+    "frontend": (Path("build/bench/frontend.json"), FRONTEND_BEGIN, FRONTEND_END, frontend_table, "make bench-frontend"),
     "inference": (Path("build/bench/inference.json"), INFERENCE_BEGIN, INFERENCE_END, inference_table, "make bench-inference"),
     "sim": (Path("build/bench/sim.json"), SIM_BEGIN, SIM_END, simulator_table, "make bench-sim"),
 }

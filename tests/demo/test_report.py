@@ -73,3 +73,13 @@ def test_the_simulators_table_shows_every_bar_and_whether_it_was_met(monkeypatch
     assert "| times ours | 2,346 | aim >= 10000 | **no** |" in text
     assert "| a response of that map, microseconds | 31.7 |" in text
     assert "left alone" in text
+
+
+def test_the_front_ends_table_has_a_row_for_every_bar_and_marks_what_is_missed():
+    bars = [{"name": "* rate_hz", "value": 1001.0, "limit": ">= 1000", "kind": "bar", "met": True},
+            {"name": "n_vectors", "value": 24, "limit": ">= 64", "kind": "aim", "met": False},
+            {"name": "s2s_deg", "value": None, "limit": "<= 0.35", "kind": "bar", "met": False}]
+    table = module.frontend_table({"seeds": [2000, 2004], "bars": bars}).splitlines()
+    assert len(table) == 2 + len(bars) and "2000 to 2004" in table[0]
+    assert table[2] == "| \\* rate_hz | 1,001 | bar >= 1000 | yes |"
+    assert table[3].endswith("| 24 | aim >= 64 | **no** |") and "| - |" in table[4]
