@@ -20,6 +20,7 @@ from pathlib import Path
 import frontend_judge
 from bench_sim import Clock, machine, plain
 
+from sparsegaze.calibrate import plain as without_nan
 from sparsegaze.errors import SparsegazeError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -70,7 +71,7 @@ def run(wanted, options):
         report["section_seconds"][name] = round(time.perf_counter() - began, 1)
         report["seconds"] = round(clock.seconds(), 1)
         report["bars"] = frontend_judge.bars(report)
-        text = json.dumps(plain(report), indent=1) + "\n"
+        text = json.dumps(without_nan(report), indent=1) + "\n"
         (options.out / "frontend.json").write_text(text, encoding="utf-8")
 
     section("methods", lambda say: methods(options.quick, say))

@@ -53,9 +53,11 @@ def noise(board, map_path, light):
         "measured": measured.mean(axis=0).tolist(),
         "expected": expected.mean(axis=0).tolist(),
         "ratio": (measured.mean(axis=0) / expected.mean(axis=0)).tolist(),
+        "place_na": np.array(current).tolist(),
         "bound_deg": found,
         "bound_250_deg": found / 2,
         "light": light,
+        "pupil_mm": pupil,
     }
 
 
@@ -64,12 +66,19 @@ def current_na(features):
     return FEATURE_UNIT_NA * 2.0 ** (np.asarray(features) / 4096)
 
 
-def relative_noise(na, exposure_us):
-    """RMS over photocurrent of one frame at nominal capacitances, in the dark, [6]."""
+def in_ambient(found, map_path, pupil_mm, exposure_us, ambient_na):
+    """The bound in steady ambient light at these exposures, nominal sensors, of what noise() found."""
+    relative = [relative_noise(np.array(na), np.array(exposure_us), ambient_na) for na in found["place_na"]]
+    places = zip(grid_places(), relative)
+    return float(np.mean([bound_deg(map_path, place, pupil_mm, one) for place, one in places]))
+
+
+def relative_noise(na, exposure_us, ambient_na=0.0):
+    """RMS over photocurrent of one frame at nominal capacitances, in steady light, [6]."""
     node = frontend_node.node_of(frontend_node.RAIL)
-    charge = na * exposure_us * 1e-3
-    lit = frontend_methods.charge_noise(frontend_node.RAIL, node, ADC_KHZ, charge)
-    dark = frontend_methods.charge_noise(frontend_node.RAIL, node, ADC_KHZ, 0.0 * charge)
+    charge, ambient = na * exposure_us * 1e-3, ambient_na * exposure_us * 1e-3
+    lit = frontend_methods.charge_noise(frontend_node.RAIL, node, ADC_KHZ, charge + ambient)
+    dark = frontend_methods.charge_noise(frontend_node.RAIL, node, ADC_KHZ, ambient)
     light = physics.emission_noise(frontend_node.RAIL.headroom_v, exposure_us)
     return np.hypot(np.hypot(lit, dark / np.sqrt(frontend_methods.UNLIT_MEAN)) / charge, light)
 

@@ -11,6 +11,7 @@ LATENCY_MEAN_MS, LATENCY_LAST_MS = 2.5, 1.5
 S2S_DEG, S2S_250_DEG, OVER_BOUND = 0.35, 0.18, 1.15
 RATIO = {"room": 1.1, "bright_room": 1.5, "sun_gap": 3.0}
 STEP_SATURATED, STEP_SETTLE = 5, 10
+VALID = 0.8  # what is left out may not be what is wrong
 FLICKER, IRRADIANCE_W_M2, SPARE = 1.2, 100.0, 0.10
 BITS_APART = 0.25  # closed form against Monte Carlo of 500 draws: 5 standard errors
 
@@ -51,6 +52,8 @@ def bars(report):
         for name, limit in RATIO.items():
             most(f"error_ratio.{name}, each frame", report["error_ratio"][name], limit)
             most(f"error_ratio_250.{name}, at 250 Hz", report["error_ratio_250"][name], limit)
+            least(f"valid frames, {name}, at 250 Hz", report["valid_250"][name], VALID)
+            least(f"valid frames, {name}, each frame", report["valid"][name], VALID, "aim")
             most(f"saturated frames after the first 5, {name}", report["saturated_after"][name], 0)
         most("step.saturated_frames", report["step"]["saturated_frames"], STEP_SATURATED)
         most("step.settle_frames", report["step"]["settle_frames"], STEP_SETTLE)

@@ -9,6 +9,7 @@ from sparsegaze import metrics
 from sparsegaze.wire import lib
 
 CPU_MHZ = 16.0
+REST_S = 0.5
 AVERAGED = 4  # frames of 1000 Hz that make one of 250 Hz
 AMBIENTS = ("dark", "room", "bright_room", "sun_gap")
 FREE_FRAMES = 5  # after a change of light, frames that may be saturated
@@ -58,18 +59,26 @@ def judge_grid(frames, target, index):
 
 def ambient(board, name, repeats=1):
     """precision() in an ambient light of physics.toml, and how many frames after its coming were saturated."""
+    rest(board)
     if repeats != 1:
         board.device.settings(repeats=repeats)
-    board.look(0, 0)
-    board.frames(0.1)
+        board.frames(0.2)
     board.control.set("ambient", name)
-    came = board.frames(0.25)
+    came = board.frames(0.3)
     found = precision(board)
+    found["exposure_us"] = list(board.device.exposure().exposure_us)
     found["saturated_after"] = saturated_after(came)
     found["rate_hz"] = rate_of(came)
     if repeats != 1:
         board.device.settings(repeats=1)
     return found
+
+
+def rest(board):
+    """Dark, and the eye straight ahead, until exposures rest."""
+    board.control.set("ambient", "dark")
+    board.look(0, 0)
+    board.frames(REST_S)
 
 
 def saturated_after(frames, free=FREE_FRAMES):
@@ -86,16 +95,17 @@ def flicker(board):
     """Errors in steady light of the signal's size, and in light that flickers at 100 and 120 Hz."""
     found = {}
     for name, depth, hz in (("steady", 0.0, 100), ("100", FLICKER, 100), ("120", FLICKER, 120)):
+        rest(board)
         board.control.ambient(SIGNAL_NA, depth, hz)
-        board.frames(0.1)
+        board.frames(0.3)
         found[name] = precision(board)
-    board.control.set("ambient", "dark")
-    board.frames(0.1)
+    rest(board)
     return found
 
 
 def steps(board, repeats, rng, place=(4.0, -6.0)):
     """Ambient steps of 1000:1 up and down, at moments that no exposure knows: dict of up and down."""
+    rest(board)
     board.look(*place)
     board.control.ambient(STEP_NA[0])
     board.frames(0.3)
@@ -105,8 +115,7 @@ def steps(board, repeats, rng, place=(4.0, -6.0)):
         at.append(moment)
         board.control.set_at(int(moment * CPU_MHZ) + int(rng.integers(0, 16)), "ambient_na", STEP_NA[(k + 1) % 2])
     frames = board.frames((at[-1] - board.now_us()) * 1e-6 + 2 * STEP_S)
-    board.control.set("ambient", "dark")
-    board.frames(0.1)
+    rest(board)
     error = error_deg(frames, np.tile(place, (len(frames), 1)))
     begin = np.searchsorted(frames["t_us"] - board.offset_us, at)
     return {"up": judge_steps(frames, error, begin[0::2]), "down": judge_steps(frames, error, begin[1::2])}
@@ -145,8 +154,7 @@ def judge_steps(frames, error, begin):
 
 def exposure_shift(board):
     """How far the mean gaze moves when nothing but the exposures changes, at the worst of some places."""
-    board.look(0, 0)
-    board.frames(0.3)
+    rest(board)
     chosen = np.array(board.device.exposure().exposure_us)
     mean, s2s = [], []
     for factor in HOLDS:

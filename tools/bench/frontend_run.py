@@ -19,6 +19,7 @@ import frontend_measures as measures
 import frontend_persons
 import numpy as np
 from frontend_board import Board, calibrated
+from frontend_physics import P
 
 LIGHTS = ("nominal", "dim", "bright")
 SLOW_REPEATS = 4  # cycles a frame: 250 Hz
@@ -62,6 +63,7 @@ def person(seed, folder, map_path, quick, say=None):
                 row.setdefault("noise", {})[light] = frontend_bound.noise(board, map_path, light)
                 if light == "nominal":
                     _nominal(board, row, quick, rng, Path(temporary))
+                    _bounds(row, map_path)
             say(f"person {seed}, {light}: " + json.dumps(_short(row["precision"][light])))
     return row
 
@@ -79,6 +81,16 @@ def _nominal(board, row, quick, rng, folder):
     row["shift"] = measures.exposure_shift(board)
     row["step"] = measures.steps(board, QUICK_STEPS if quick else STEPS, rng)
     row["stream"] = measures.stream(board, QUICK_STREAM_S if quick else STREAM_S, rng, folder / "frames.csv")
+
+
+def _bounds(row, map_path):
+    """The physical limit beside the precision in steady light: room and bright room flicker, which costs more."""
+    noise = row["noise"]["nominal"]
+    for name, na in (("room", P.ambient.room_na), ("bright_room", P.ambient.bright_room_na), ("sun_gap", P.ambient.sun_gap_na)):
+        for table, repeats in (("ambient", 1), ("ambient_250", SLOW_REPEATS)):
+            found = row[table][name]
+            bound = frontend_bound.in_ambient(noise, map_path, noise["pupil_mm"], found["exposure_us"], na)
+            found["bound_deg"] = bound / np.sqrt(repeats)
 
 
 def _short(found):
@@ -135,6 +147,8 @@ def worst(rows):
         ):
             value = most(lambda row, t=table, f=field, n=name: ratios(row, t, f)[n])
             out.setdefault(key, {})[name] = value
+        for key, table in (("valid", "ambient"), ("valid_250", "ambient_250")):
+            out.setdefault(key, {})[name] = min(row[table][name]["valid"] for row in rows)
         out.setdefault("saturated_after", {})[name] = most(
             lambda row, n=name: row["ambient"][n]["saturated_after"] + row["ambient_250"][n]["saturated_after"]
         )
