@@ -87,7 +87,7 @@ extern uint8_t sense_gap[GAP_BYTES];                    // the list of a pause: 
 extern const uint8_t *volatile sense_list_next; // list that follows the running one
 extern uint16_t *sense_out;                     // where the next code goes
 extern uint16_t sense_slot;                     // cycles from trigger to trigger
-extern uint16_t sense_base;                     // TCNT1 at the latest known instant, and how often it wrapped
+extern volatile uint16_t sense_base;                     // TCNT1 at the latest known instant, and how often it wrapped
 extern volatile uint32_t sense_wraps;           // until then
 extern uint8_t sense_left, sense_last;          // of the frame: cycles still to come, and at its beginning
 extern uint16_t sense_seq;

@@ -31,7 +31,7 @@ uint8_t sense_gap[GAP_BYTES];
 const uint8_t *volatile sense_list_next;
 uint16_t *sense_out;
 uint16_t sense_slot;
-uint16_t sense_base;
+volatile uint16_t sense_base;
 volatile uint32_t sense_wraps;
 uint8_t sense_left, sense_last;
 uint16_t sense_seq;

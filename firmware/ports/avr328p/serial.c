@@ -188,7 +188,7 @@ uint8_t serial_poll(void)
         carry_out();
     if (rx_tail == rx_head)
         return 0;
-    while (left-- && rx_tail != rx_head && serial_room() >= SG_WIRE_FRAME_MAX && !after_pending) {
+    while (left-- && rx_tail != rx_head && app_listens() && serial_room() >= SG_WIRE_FRAME_MAX && !after_pending) {
         uint16_t zero;
         ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
             zero = zero_ticks;
