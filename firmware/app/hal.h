@@ -111,5 +111,7 @@ void app_on_cycle(const struct hal_cycle *cycle);
 // (SG_WIRE_FRAME_MAX) fits into the send queue: what is not delivered waits, so a request is never dropped
 // for want of room for its answer.
 void app_on_byte(uint8_t byte, uint32_t zero_us);
+// Is there time for the next byte? While this is 0 it waits.
+uint8_t app_listens(void);
 
 #endif

@@ -168,7 +168,7 @@ static void finish_frame(const struct hal_cycle *cycle)
     HAL_BEGIN(HAL_SECTION_OUTPUT);
     if (app.stream & SG_STREAM_GAZE) {
         out->gaze.t_us = t_us;
-        out->gaze.infer_us = (uint16_t)hal_now_us() - (uint16_t)t_us - span_us;
+        out->gaze.infer_us = hal_now_us16() - (uint16_t)t_us - span_us;
         send_stream(SG_MSG_GAZE, &out->gaze, sizeof out->gaze);
     }
     if (app.stream & SG_STREAM_RAW) {

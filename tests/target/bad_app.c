@@ -66,6 +66,11 @@ static void report(void)
     answer(SG_MSG_STATUS | SG_REPLY, &status, sizeof status);
 }
 
+uint8_t app_listens(void)
+{
+    return 1;
+}
+
 void app_on_byte(uint8_t byte, uint32_t zero_us)
 {
     (void)zero_us;

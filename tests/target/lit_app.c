@@ -25,6 +25,11 @@ void app_on_cycle(const struct hal_cycle *cycle)
 #endif
 }
 
+uint8_t app_listens(void)
+{
+    return 1;
+}
+
 void app_on_byte(uint8_t byte, uint32_t zero_us)
 {
     const struct sg_head head = { .seq = cycles, .type = SG_MSG_RAW, .flags = byte };

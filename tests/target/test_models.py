@@ -18,7 +18,7 @@ from sparsegaze.qemu import QemuBoard
 from sparsegaze.wire import lib
 
 # Of what the host's core and the device both compute; changes only with the arithmetic itself.
-GOLDEN_CRC = {1: 0x0D7DA0D0, 64: 0x76A99246, 100: 0x97C657F8}
+GOLDEN_CRC = {1: 0x40745CC1, 64: 0x768113E0, 100: 0x817841BB}
 
 
 def head_at(field):
