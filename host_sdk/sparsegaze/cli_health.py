@@ -39,9 +39,10 @@ def status(port, as_json):
     """
     from . import faults
     from .device import Device
+    from .doctor_port import SETTLE_S
 
     with Device(port) as device:
-        device.link.sleep(0.3)  # after a reset the first readings, and with them the faults, take a moment
+        device.link.sleep(SETTLE_S)
         now, exposure, settings, hello = device.status(), device.exposure(), device.settings(), device.hello
     found = faults.of(now, port)
     counters = {name: getattr(now, name) for name in COUNTERS}
@@ -92,7 +93,7 @@ def linearity(port, as_json):
     """Self-calibration: measure and store how charge and converter code bend at each sensor of PORT.
 
     Takes 20 s, best before `calibrate`, with the headset on and looking straight ahead, or before white
-    paper: the light must be steady. Exposures alternate between the automatic ones and fractions of these;
+    paper: the light must be steady. Exposures alternate between long ones and fractions of these;
     what a sensor then reads must not change. Shifts are of a quarter of the exposure against the whole, in
     percent of the light and in octaves.
 

@@ -184,7 +184,7 @@ def change(device, port, wanted):
     ]
     if rate > now.rate_hz + max(1, rate // 200) or differs:
         limit, repeats = now.rate_limit_hz, now.repeats
-        _restore(device, before)
+        device.settings_back(before)
         if differs:
             raise SparsegazeError(
                 f"this firmware does not do {differs[0]} {wanted[differs[0]]}", "nothing was changed"
@@ -202,17 +202,6 @@ def change(device, port, wanted):
         )
     wait_stored(device, written)
     return now, vectors
-
-
-def _restore(device, before):
-    device.settings(
-        rate_hz=0 if before.rate_hz >= before.rate_limit_hz else before.rate_hz,
-        repeats=before.repeats,
-        power=before.power_text,
-        wiring=before.wiring_text,
-        rolling=before.rolling,
-        lights=before.lights,
-    )
 
 
 @click.command()
@@ -235,7 +224,7 @@ def exposure(port, mode, fixed, limit, as_json):
         sparsegaze exposure /dev/ttyUSB0 --auto --limit 90
     """
     from .device import Device
-    from .sensing import wait_stored
+    from .sensing import EXPOSURE_REST_S, wait_stored
 
     if mode and fixed:
         raise click.UsageError(f"--{mode} and --set exclude each other")
@@ -251,6 +240,7 @@ def exposure(port, mode, fixed, limit, as_json):
             device.exposure(auto=mode == "auto")
         now, hello = device.exposure(), device.hello
         if limit or fixed or mode:
+            device.link.sleep(EXPOSURE_REST_S)
             wait_stored(device, written)
     clipped = fixed is not None and any(abs(a - b) > 0.05 * b for a, b in zip(now.exposure_us, fixed))
     console = Console(as_json)

@@ -6,7 +6,8 @@ from .wire import Curve, Exposure, Probe, Settings, lib
 
 
 STORE_S = 0.25                  # a record in EEPROM takes less than this
-STORE_LIMIT_S = 4.0             # exposures are stored once they have rested for two seconds
+STORE_LIMIT_S = 4.0
+EXPOSURE_REST_S = 2.2           # exposures are stored once they have rested for so long
 
 
 def wait_stored(device, written, limit_s=STORE_LIMIT_S):
@@ -68,6 +69,12 @@ class Sensing:
         fields.update(wanted, op=lib.SG_SETTINGS_SET)
         return self._exchange.request(lib.SG_MSG_SETTINGS, wire.body("struct sg_settings", **fields),
                                       Settings)
+
+    def settings_back(self, before):
+        """Settings as they were: `before` is a Settings of this device. Returns Settings."""
+        return self.settings(
+            rate_hz=0 if before.rate_hz >= before.rate_limit_hz else before.rate_hz, repeats=before.repeats,
+            wiring=before.wiring_text, power=before.power_text, rolling=before.rolling, lights=before.lights)
 
     def curve(self, curve=None, zero_codes=None):
         """Curve: each channel's curvature, charge = code (1 + curve code / 1024), and the converter's zero.

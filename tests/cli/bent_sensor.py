@@ -4,7 +4,7 @@
 import numpy as np
 from fake_device import MIDDLE, FakeDevice
 
-from sparsegaze.linearity import NOMINAL
+from sparsegaze.curvefit import NOMINAL
 from sparsegaze.wire import Counts
 
 FULL = 12.0  # codes of our light, a microsecond, at feature MIDDLE

@@ -13,6 +13,7 @@ from sparsegaze import replay, wire
 from sparsegaze.device import Frame
 from sparsegaze.errors import DeviceError, DisconnectedError
 from sparsegaze.model import DeviceModel
+from sparsegaze.sensing import Sensing
 from sparsegaze.wire import Curve, Exposure, Gaze, Probe, Raw, Recentre, Settings, Status, lib
 
 FRAME_US = 3840
@@ -206,6 +207,9 @@ class FakeDevice:
 
     def _changed(self):
         self.stored_us = self.t_us + 200_000
+
+    def settings_back(self, before):
+        return Sensing.settings_back(self, before)
 
     def settings(self, **wanted):
         """As sensing.Sensing.settings; the rate in force is the one wanted, or the limit."""

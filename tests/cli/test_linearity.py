@@ -3,9 +3,9 @@
 
 import numpy as np
 import pytest
-from bent_sensor import BentSensor
+from bent_sensor import FULL, BentSensor
 
-from sparsegaze import linearity
+from sparsegaze import curvefit, linearity
 from sparsegaze.errors import CalibrationError
 from sparsegaze.wire import lib
 
@@ -32,8 +32,8 @@ def test_finds_every_curve_and_takes_the_shift_away(wander, ambient):
     done = linearity.run(device)
     assert done.kept and np.abs(done.curve - BEND).max() < 0.004
     assert np.abs(np.array(device.curves) / 1024 - done.curve).max() < 1e-9
-    # Of 600 codes to 150, and of as much more as the light around brings, to first order.
-    wanted = BEND * (600 + 2 * 50 * ambient) / 1024 * 0.75 / np.log(2)
+    # Of codes that add up so to a quarter of them, to first order.
+    wanted = BEND * (done.codes * (1 + 2 * ambient / FULL)) / 1024 * 0.75 / np.log(2)
     assert np.abs(done.before - wanted).max() < 0.25 * np.abs(wanted).max()
     assert np.abs(done.after).max() < 0.003 < np.abs(done.before).max()
     assert device.automatic and device.stream[-1] == (False, False, False)
@@ -86,7 +86,7 @@ def test_a_light_that_flickers_slowly_is_refused():
 
 
 def test_too_weak_a_light_is_refused_and_names_the_sensors():
-    device = BentSensor(BEND, light=0.2, frame_us=1999)
+    device = BentSensor(BEND, light=0.03, frame_us=1999)
     with pytest.raises(CalibrationError, match="sensor 5 .*of 1023 codes") as caught:
         linearity.run(device)
     assert "white paper" in caught.value.remedy
@@ -120,8 +120,8 @@ def test_settings_and_held_exposures_are_given_back():
 
 def test_curves_that_are_no_better_are_not_kept(monkeypatch):
     device = BentSensor(BEND, frame_us=1999)
-    honest = linearity.fit
-    monkeypatch.setattr(linearity, "fit", lambda holds, curve: honest(holds, curve)._replace(curve=-BEND))
+    honest = curvefit.fit
+    monkeypatch.setattr(curvefit, "fit", lambda *args: honest(*args)._replace(curve=-BEND))
     done = linearity.run(device)
     assert not done.kept and device.curves == (0,) * 6
 
