@@ -49,7 +49,7 @@ def test_boots_are_counted_through_power_cycles(board):
 def test_exposures_start_from_the_stored_ones(board):
     nano, device = board()
     device.exposure(us=[40, 50, 60, 70, 80, 90])
-    device.link.sleep(0.5)
+    device.link.sleep(3.0)          # stored when it has rested for two seconds
     power_cycle(nano, device)
     assert device.exposure().exposure_us == (40, 50, 60, 70, 80, 90) and not device.exposure().automatic
 

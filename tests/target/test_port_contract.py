@@ -31,5 +31,5 @@ def test_every_port_implements_exactly_the_contract(repo_root):
     assert 8 <= len(wanted) <= 16
     for port in ("template", "avr328p", "mps2an386"):
         text = "\n".join(path.read_text() for path in sorted((firmware / "ports" / port).glob("*.c")))
-        found = re.findall(r"^(?!static)[a-z][^;\n=]*?\b(hal_\w+)\([^;{]*\)\s*\{", text, re.M)
+        found = re.findall(r"^(?!static)(?:[A-Z]+ )?[a-z][^;\n=]*?\b(hal_\w+)\([^;{]*\)\s*\{", text, re.M)
         assert set(found) == wanted, port
