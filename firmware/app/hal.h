@@ -21,7 +21,8 @@ enum { HAL_CHANNELS = SG_WIRE_CHANNELS };
 struct hal_cycle {
     uint32_t t_us;                      // mean of the six lit mid-exposure times, device time
     uint16_t span_us;                   // from t_us to the last sample of the cycle
-    uint16_t seq;                       // low half of the number of frames begun since boot: the frame it belongs to
+    // Low half of the number of frames begun since boot: the frame it belongs to.
+    uint16_t seq;
     uint8_t left;                       // cycles of this frame still to come; 0: its last
     struct sg_reading reading;
 };
@@ -34,7 +35,8 @@ struct hal_timing {
     uint8_t wiring;                     // enum sg_wiring
     uint8_t lights;                     // 0: never lit
     uint8_t probe;                      // 0..5: the only emitter, which does not sense then; 255: as wired
-    uint8_t sleep;                      // 1: hal_poll() sleeps until the next interrupt when it has nothing to do
+    // 1: hal_poll() sleeps until the next interrupt when it has nothing to do.
+    uint8_t sleep;
 };
 
 // ----------------------------------------------------------------------------------------------------
@@ -47,8 +49,8 @@ void hal_boot(void);
 // exposure_max_us, page_bytes, board. The rest is left alone.
 void hal_describe(struct sg_hello *hello);
 
-// Start sensing, serial line and watchdog, with this timing and these exposures (cycles), both clipped as below.
-// After a reset by the watchdog the lights stay off for a second (hal_report's alarm says so).
+// Start sensing, serial line and watchdog, with this timing and these exposures (cycles), both clipped as
+// below. After a reset by the watchdog the lights stay off for a second (hal_report's alarm says so).
 void hal_start(struct hal_timing *timing, uint16_t exposure_cycles[HAL_CHANNELS]);
 
 // One turn of the main loop: delivers what has arrived through the up-calls, moves slow writes on, and feeds
@@ -61,13 +63,14 @@ uint32_t hal_now_us(void);
 // Its low half, at less cost.
 uint16_t hal_now_us16(void);
 
-// Exposures from a cycle soon on, clipped to the port's limits and to what the timing allows, and moved by a few
-// per cent where two releases would collide: `exposure_cycles` is what was taken. Whole: no cycle sees half of it.
+// Exposures from a cycle soon on, clipped to the port's limits and to what the timing allows, and moved by a
+// few per cent where two releases would collide: `exposure_cycles` is what was taken. Whole: no cycle sees
+// half of it.
 void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS]);
 
-// Timing from a cycle soon on, clipped to what the port can do: `timing` is what was taken. A frame begins with
-// it. Pauses that the port cannot make (some hundred cycles) become longer or shorter cycles. Exposures are
-// clipped as by hal_expose().
+// Timing from a cycle soon on, clipped to what the port can do: `timing` is what was taken. A frame begins
+// with it. Pauses that the port cannot make (some hundred cycles) become longer or shorter cycles. Exposures
+// are clipped as by hal_expose().
 void hal_set_timing(struct hal_timing *timing);
 // Longest exposure of a channel under this timing, cycles.
 uint16_t hal_exposure_most(uint8_t channel);
@@ -96,15 +99,16 @@ uint8_t hal_save(const void *record, uint8_t n);
 // The port's bits of sg_status.alarm, at little cost.
 uint8_t hal_alarm(void);
 
-// Fill in the port's part: frames, late_frames (app_on_cycle returned after the next cycle was complete, or was never
-// called), late_slots (cycles given up because interrupts were blocked), rx_overrun, stack_free, reset_cause,
-// eeprom_writes, supply_mv, cycles_max, and its bits of alarm.
+// Fill in the port's part: frames, late_frames (app_on_cycle returned after the next cycle was complete, or
+// was never called), late_slots (cycles given up because interrupts were blocked), rx_overrun, stack_free,
+// reset_cause, eeprom_writes, supply_mv, cycles_max, and its bits of alarm.
 void hal_report(struct sg_status *status);
 
 // ----------------------------------------------------------------------------------------------------
 // Up-calls: the port calls, the application implements.
 
-// A sensing cycle is complete. Called at most once per hal_poll(), with the newest; borrowed until it returns.
+// A sensing cycle is complete. Called at most once per hal_poll(), with the newest; borrowed until it
+// returns.
 void app_on_cycle(const struct hal_cycle *cycle);
 
 // One byte arrived; zero_us is when the latest 0x00 arrived. Called only while one whole reply

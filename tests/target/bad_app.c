@@ -6,7 +6,8 @@
 //   BLOCK        interrupts are off for 250 us in every 16th cycle, later and later in it
 //   SHORT_BLOCK  the same for 6 us
 //   SLOW         5 ms of work for cycles that come every millisecond
-// It is told by bytes without any frame around them: a letter and structs as they lie in memory (port_app.py).
+// It is told by bytes without any frame around them: a letter and structs as they lie in memory
+// (port_app.py).
 // It answers in packets of PROTOCOL.md's coding whose bodies are structs as they lie in memory.
 #include <avr/interrupt.h>
 #include <avr/io.h>
@@ -23,7 +24,7 @@ static uint8_t cycles_wanted;           // cycles are sent
 static uint8_t noise;                   // the line is kept full
 static uint16_t exposure_cycles[HAL_CHANNELS] = { 1600, 1600, 1600, 1600, 1600, 1600 };
 static struct hal_timing timing = { .period_cycles = 15984, .repeats = 1, .lights = 1, .probe = 255 };
-static uint8_t told[1 + sizeof timing > 1 + sizeof exposure_cycles ? 1 + sizeof timing : 1 + sizeof exposure_cycles];
+static uint8_t told[16];
 static uint8_t told_bytes;
 
 static void answer(uint8_t type, const void *body, uint8_t n)

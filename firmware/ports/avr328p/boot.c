@@ -50,9 +50,9 @@ void boot_first(void)
 }
 
 // Optiboot 4 keeps these constants in registers from the moment it begins to listen, which it does after an
-// external reset only: in one set of registers as boards carry it, in another when gcc 7 builds its source. It
-// leaves through its watchdog; a watchdog reset while the application runs finds the application's registers
-// instead.
+// external reset only: in one set of registers as boards carry it, in another when gcc 7 builds its source.
+// It leaves through its watchdog; a watchdog reset while the application runs finds the application's
+// registers instead.
 static uint8_t bootloader_listened(void)
 {
     return left.r14 == 0x01
@@ -95,7 +95,8 @@ uint8_t boot_reset_cause(void)
 
 uint16_t boot_stack_free(void)
 {
-    // In strides, because a frame waits meanwhile: what is deepest on a stack is addresses and registers in a row.
+    // In strides, because a frame waits meanwhile: what is deepest on a stack is addresses and registers in a
+    // row.
     const uint8_t *p = &__heap_start;
     while (p[STRIDE - 1] == PAINT)
         p += STRIDE;

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// From exposures to lists of events for the sensing interrupt: one for each pair of sensors, run through lit and
-// again unlit, three slots each: GND, a, b. What happens before a half's samples begins right after the sample
-// before them, in the slot before its first.
+// From exposures to lists of events for the sensing interrupt: one for each pair of sensors, run through lit
+// and again unlit, three slots each: GND, a, b. What happens before a half's samples begins right after the
+// sample before them, in the slot before its first.
 //
 // Samples are fixed, releases follow from the exposures, services have most of a slot to choose from: where a
-// release is near, it comes first and the service after it. Only two releases of one half can be in each other's
-// way; plan_clip() moves the second sensor's exposure then.
+// release is near, it comes first and the service after it. Only two releases of one half can be in each
+// other's way; plan_clip() moves the second sensor's exposure then.
 #include "port_sense.h"
 
 #include <avr/pgmspace.h>
@@ -81,7 +81,8 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
 {
     const int16_t slot = (int16_t)plan->slot_cycles;
     uint8_t *const begin = to;
-    const uint8_t a = plan_channel(timing->wiring, 2 * phase), b = plan_channel(timing->wiring, 2 * phase + 1);
+    const uint8_t a = plan_channel(timing->wiring, 2 * phase);
+    const uint8_t b = plan_channel(timing->wiring, 2 * phase + 1);
     uint8_t bits = bit(a), more = bit(b);
     uint8_t admux_a = ADMUX_CHANNEL_0 + a, admux_b = ADMUX_CHANNEL_0 + b;
     uint8_t portc = PORTC_ALL & (uint8_t)~(bits | more), portd = PORTD_DARK;
@@ -129,8 +130,8 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
         uint8_t released = 0;
         while (left) {
             int16_t at = release - (set ? LIGHT_LEAD_CYCLES : RELEASE_LEAD_CYCLES);
-            // A service right after a release costs no interrupt of its own; but lights go out in time, and the
-            // result is read before the next.
+            // A service right after a release costs no interrupt of its own; but lights go out in time, and
+            // the result is read before the next.
             if (k == 0) {
                 if (at >= service + HOLD_CYCLES)
                     break;

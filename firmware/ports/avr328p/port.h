@@ -13,7 +13,8 @@
 
 enum port_limits {
     CYCLES_PER_US = 16,
-    // A sensing cycle is 18 slots, a conversion each: three phases of GND, a lit, b lit, GND, a unlit, b unlit.
+    // A sensing cycle is 18 slots, a conversion each: three phases of GND, a lit, b lit, GND, a unlit, b
+    // unlit.
     SLOTS = 18,
     SLOT_CYCLES_MIN = 888,          // a conversion takes 868 of them
     SLOT_CYCLES_MAX = 1777,
@@ -21,11 +22,12 @@ enum port_limits {
     // go into synchronisation (datasheet, ADC auto triggering), then two ADC clocks of 64 cycles.
     SAMPLE_CYCLES = 1 + 3 + 2 * 64,
     EXPOSURE_MIN_CYCLES = 64,
-    // Of a pair's second: let go, late as it may be, before the sample capacitor comes with what the first left on it.
+    // Of a pair's second: let go, late as it may be, before the sample capacitor comes with what the first
+    // left on it.
     EXPOSURE_SECOND_MIN_CYCLES = 208,
-    // The eye-safety cap: the first sensor of a pair is exposed at most 2 slots less this, the second 3 slots less
-    // this, and lights are on from at most LIGHTS_AHEAD_CYCLES before the first release until just after the
-    // second sample: 3 of the 6 slots of a phase. No command and no caller gets past plan_clip().
+    // The eye-safety cap: the first sensor of a pair is exposed at most 2 slots less this, the second 3 slots
+    // less this, and lights are on from at most LIGHTS_AHEAD_CYCLES before the first release until just after
+    // the second sample: 3 of the 6 slots of a phase. No command and no caller gets past plan_clip().
     EXPOSURE_LESS_CYCLES = 120,
     LIGHTS_AHEAD_CYCLES = 120,
     LOCKOUT_MS = 1000,              // lights stay off that long after a reset by the watchdog

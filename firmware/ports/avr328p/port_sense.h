@@ -1,42 +1,51 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the planner (plan.c) writes, what the sensing interrupt (sense_isr.c) reads and fills, and what the main
-// loop takes from it (sense.c).
+// What the planner (plan.c) writes, what the sensing interrupt (sense_isr.c) reads and fills, and what the
+// main loop takes from it (sense.c).
 #ifndef PORT_SENSE_H
 #define PORT_SENSE_H
 
 #include "port.h"
 
 // A plan is three lists of events, one for each pair of sensors, run twice each: lit and unlit. An event is a
-// little-endian word, kind in the four bits on top and cycles to the next event's compare match below, and what the
-// kind needs. A compare match comes some cycles before what it is for.
+// little-endian word, kind in the four bits on top and cycles to the next event's compare match below, and
+// what the kind needs. A compare match comes some cycles before what it is for.
 enum event {                        // of the word's high byte
     EVENT_CYCLES = 0x0F,
-    // Service of a slot, one byte: ADMUX of the next slot. Reads the result of the slot before, arms the next.
+    // Service of a slot, one byte: ADMUX of the next slot. Reads the result of the slot before, arms the
+    // next.
     EVENT_SERVICE = 0x00,
     EVENT_STORE = 0x10,             // and keeps the result
     EVENT_COMPLETE = 0x20,          // and keeps it; if lit, the cycle before is complete
     EVENT_DARK_STORE = 0x30,        // and keeps it, after lights are out and all nodes held
-    EVENT_AGAIN = 0x40,             // no event; one byte: length of the list, which is run again unlit if it was lit
+    // No event; one byte: length of the list, which is run again unlit if it was lit.
+    EVENT_AGAIN = 0x40,
     EVENT_LAST = 0x50,              // the same, but then `list_next` follows
     EVENT_WAIT = 0x60,              // the pause between frames
-    EVENT_RELEASE = 0x80,           // one byte: DDRC, exactly RELEASE_LEAD_CYCLES after the match; and a service, or
-    EVENT_ALONE = 0x30,             // none
-    EVENT_SET_RELEASE = 0xC0,       // the same; four bytes: PORTC and PORTD at once, if lit; lead less LEAD_LESS_CYCLES; DDRC exactly lead later
+    // One byte: DDRC, exactly RELEASE_LEAD_CYCLES after the match. A service follows at once, with its kind and its
+    // byte, or none.
+    EVENT_RELEASE = 0x80,
+    EVENT_ALONE = 0x30,
+    // The same with four bytes: PORTC and PORTD at once, if lit; lead less LEAD_LESS_CYCLES; DDRC exactly lead
+    // after the match.
+    EVENT_SET_RELEASE = 0xC0,
 };
 
 enum sense_cycles {
     SERVICE_AT = 40,                // compare match of a service after its slot's trigger, at the earliest
     SERVICE_LATEST = 388,           // from its slot's trigger to the first release it follows, at most
-    HOLD_AT = SAMPLE_CYCLES - 40,   // of the first event after a half's samples; it acts 43 cycles later at the earliest
+    // Of the first event after a half's samples; it acts 43 cycles later at the earliest.
+    HOLD_AT = SAMPLE_CYCLES - 40,
     RELEASE_LEAD_CYCLES = 98,       // 76 when nothing is in the way
     LIGHT_LEAD_CYCLES = 113,
-    HOLD_CYCLES = 166,              // from the first event's match, a service, to a release's, so that that is not late
+    // From the first event's match, a service, to a release's, so that that is not late.
+    HOLD_CYCLES = 166,
     SPACING_CYCLES = 200,           // the same of the others: the one that completes a cycle takes longer
-    WITH_RELEASE_CYCLES = 20,       // from SERVICE_AT to a release that the service can follow without an interrupt
+    // From SERVICE_AT to a release that the service can follow without an interrupt.
+    WITH_RELEASE_CYCLES = 20,
     AFTER_RELEASE_CYCLES = 4,       // from a release to the next event's match
     EXPOSURES_APART_CYCLES = 96,    // two releases: this far apart, or one
-    // Of the wait, from the TCNT1 it looks at to the end of OUT, without the wait itself; and what a list's lead is
-    // stated less, so that it fits into a byte.
+    // Of the wait, from the TCNT1 it looks at to the end of OUT, without the wait itself; and what a list's
+    // lead is stated less, so that it fits into a byte.
     RELEASE_FIXED_CYCLES = 27,
     LEAD_LESS_CYCLES = 24,
 };
@@ -61,8 +70,8 @@ struct plan {
     uint8_t *first_mux;             // ADMUX of slot 0
 };
 
-// One cycle as the interrupt leaves it. Codes in the order of slots: of the first pair GND, lit a, b, GND, unlit a,
-// b; of the others lit a, b, unlit a, b.
+// One cycle as the interrupt leaves it. Codes in the order of slots: of the first pair GND, lit a, b, GND,
+// unlit a, b; of the others lit a, b, unlit a, b.
 struct taken {
     uint16_t code[CODES];
     uint16_t end;                   // TCNT1 at the trigger after the last slot
@@ -87,7 +96,8 @@ extern uint8_t sense_gap[GAP_BYTES];                    // the list of a pause: 
 extern const uint8_t *volatile sense_list_next; // list that follows the running one
 extern uint16_t *sense_out;                     // where the next code goes
 extern uint16_t sense_slot;                     // cycles from trigger to trigger
-extern volatile uint16_t sense_base;                     // TCNT1 at the latest known instant, and how often it wrapped
+// TCNT1 at the latest known instant, and how often it wrapped.
+extern volatile uint16_t sense_base;
 extern volatile uint32_t sense_wraps;           // until then
 extern uint8_t sense_left, sense_last;          // of the frame: cycles still to come, and at its beginning
 extern uint16_t sense_seq;
@@ -104,7 +114,8 @@ const uint8_t *sense_give_up(void);             // a trigger was missed: lights 
 
 // plan.c
 extern const uint8_t plan_place[2][HAL_CHANNELS];        // in flash
-uint8_t plan_channel(uint8_t wiring, uint8_t place);    // of the sensor at a place: 2 * pair, + 1 for its second
+// Of the sensor at a place: 2 * pair, + 1 for its second.
+uint8_t plan_channel(uint8_t wiring, uint8_t place);
 // Limits, and two releases not too near each other.
 void plan_clip(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t wiring, uint16_t slot_cycles);
 // One list, from plan->exposure_cycles, which are clipped, and plan->slot_cycles; in order 0, 1, 2.

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The rings of the serial line, and how a byte gets into the receiver's: by its interrupt (serial.c), which has
-// to be short. The receiver itself holds two bytes, 20 us at 1 Mbaud.
+// The rings of the serial line, and how a byte gets into the receiver's: by its interrupt (serial.c), which
+// has to be short. The receiver itself holds two bytes, 20 us at 1 Mbaud.
 #ifndef PORT_SERIAL_H
 #define PORT_SERIAL_H
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The sensing engine as the main loop sees it: what to sense next (exposures, timing, lights), what was sensed, and
-// the pauses between frames. The cycles themselves run in sense_isr.c after the plans of plan.c.
+// The sensing engine as the main loop sees it: what to sense next (exposures, timing, lights), what was
+// sensed, and the pauses between frames. The cycles themselves run in sense_isr.c after the plans of plan.c.
 #include "port_sense.h"
 
 #include <avr/pgmspace.h>
@@ -98,8 +98,8 @@ static uint16_t ticks_now(void)
     return ticks;
 }
 
-// TCNT1, and how often it wrapped. Read again if the interrupt went on meanwhile, which is off as little as can be: a
-// release may be waiting.
+// TCNT1, and how often it wrapped. Read again if the interrupt went on meanwhile, which is off as little as
+// can be: a release may be waiting.
 HOT static uint32_t now(uint16_t *ticks)
 {
     uint32_t wraps;
@@ -164,7 +164,8 @@ SELDOM static const uint8_t *begin_at(uint16_t hold)
     sense_drop = 1;
     sense_out = &filling()->code[CODES - 2];
     sense_list_next = sense_pause && sense_left == 0 ? sense_gap : plan->event;
-    // As if another cycle had gone before: a conversion of GND, the next trigger a slot later, nothing of it kept.
+    // As if another cycle had gone before: a conversion of GND, the next trigger a slot later, nothing of it
+    // kept.
     ADMUX = ADMUX_GROUND;
     OCR1B = hold - HOLD_AT;
     OCR1A = hold;
@@ -262,8 +263,8 @@ SELDOM void hal_set_timing(struct hal_timing *t)
     if (t->repeats > SG_LIGHT_REPEATS_MAX)
         t->repeats = SG_LIGHT_REPEATS_MAX;
     uint16_t n = SLOT_CYCLES_MIN;
-    for (uint16_t left = t->period_cycles; left >= SLOTS * (SLOT_CYCLES_MIN + 1) && n < SLOT_CYCLES_MAX; left -= SLOTS)
-        n++;
+    for (uint16_t left = t->period_cycles; left >= SLOTS * (SLOT_CYCLES_MIN + 1) && n < SLOT_CYCLES_MAX; n++)
+        left -= SLOTS;
     __uint24 pause = t->frame_cycles > PAUSE_MOST ? PAUSE_MOST : (__uint24)t->frame_cycles;
     for (uint8_t k = t->repeats; k != 0; k--)
         pause = pause > SLOTS * n ? pause - SLOTS * n : 0;
@@ -328,8 +329,10 @@ void sense_poll(void)
     // The other plan is free when neither the running cycle nor the newest complete one follows it.
     if ((plan_new || written) && sense_current == plan_next && filling()->other->plan == plan_next)
         write_plan();
-    // Its other GND slot must be over, and the same plan go on. Interrupts stay on: what is left of the cycle is long.
-    if (supply == SUPPLY_WANTED && sense_current == plan_next && sense_list_next == sense_plan[plan_next].event) {
+    // Its other GND slot must be over, and the same plan go on. Interrupts stay on: what is left of the cycle
+    // is long.
+    if (supply == SUPPLY_WANTED && sense_current == plan_next
+        && sense_list_next == sense_plan[plan_next].event) {
         const uint8_t done = sense_done;
         const uint16_t since = ticks_now() - sense_base;
         if (since > 3 * sense_slot && since < 12 * sense_slot && done == sense_done)
@@ -394,7 +397,8 @@ SELDOM static void show_plan(struct sg_reading *reading, uint8_t index)
     memcpy(reading->exposure_cycles, plan->exposure_cycles, sizeof plan->exposure_cycles);
     for (uint8_t i = 0; i < HAL_CHANNELS; i++)
         sum += plan->exposure_cycles[i];
-    // Mean of the mid-exposures: lit are slots 1, 2, 7, 8, 13 and 14, 7.5 on average; sum / 12 as sum * 5461 / 2^16.
+    // Mean of the mid-exposures: lit are slots 1, 2, 7, 8, 13 and 14, 7.5 on average; sum / 12 as sum * 5461
+    // / 2^16.
     sum = (uint16_t)((uint32_t)sum * 5461U >> 16);
     const uint16_t n = plan->slot_cycles;
     mean_to_last = 9 * n + (n >> 1) + sum;

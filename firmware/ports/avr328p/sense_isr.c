@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // The sensing interrupt: serves the events of a plan one after the other (port_sense.h).
 //
-// In assembler for its cycles: some 25 events in 15984 of them. Where the list stands is kept in OCR0A and OCR0B,
-// whether it runs lit in GPIOR2 (0xFF; 0: unlit): one instruction reads or writes these, and nothing else uses
-// Timer0. An event that is due when the one before ends
-// is served at once; else OCR1A brings the interrupt. r26 and r27 hold an event's word, Z the list, then others.
+// In assembler for its cycles: some 25 events in 15984 of them. Where the list stands is kept in OCR0A and
+// OCR0B, whether it runs lit in GPIOR2 (0xFF; 0: unlit): one instruction reads or writes these, and nothing
+// else uses Timer0. An event that is due when the one before ends is served at once; else OCR1A brings the
+// interrupt. r26 and r27 hold an event's word, Z the list, then others.
 #include "port_sense.h"
 #include "port_serial.h"
 
@@ -12,11 +12,11 @@
 
 enum { WAIT_LEAST = 4, SOON_CYCLES = 48 };
 
-#define CALL_C(function)                                                                                    \
-    "push r0" "\n\t" "push r1" "\n\t" "push r18" "\n\t" "push r19" "\n\t"                                       \
-    "push r20" "\n\t" "push r21" "\n\t" "push r22" "\n\t" "push r23" "\n\t" "clr r1" "\n\t"                     \
-    "call " function "\n\t"                                                                         \
-    "pop r23" "\n\t" "pop r22" "\n\t" "pop r21" "\n\t" "pop r20" "\n\t"                                         \
+#define CALL_C(function)                                                                                \
+    "push r0" "\n\t" "push r1" "\n\t" "push r18" "\n\t" "push r19" "\n\t"                               \
+    "push r20" "\n\t" "push r21" "\n\t" "push r22" "\n\t" "push r23" "\n\t"                             \
+    "clr r1" "\n\t" "call " function "\n\t"                                                             \
+    "pop r23" "\n\t" "pop r22" "\n\t" "pop r21" "\n\t" "pop r20" "\n\t"                                 \
     "pop r19" "\n\t" "pop r18" "\n\t" "pop r1" "\n\t" "pop r0" "\n\t"
 
 ISR(TIMER1_COMPA_vect, ISR_NAKED)
@@ -62,7 +62,8 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         : : [begin] "M"(2 * HAL_SECTION_SENSE + 1), [mark] "I"(_SFR_IO_ADDR(GPIOR0)),
           [list_low] "I"(_SFR_IO_ADDR(OCR0A)), [list_high] "I"(_SFR_IO_ADDR(OCR0B)),
           [portc] "I"(_SFR_IO_ADDR(PORTC)), [ddrc] "I"(_SFR_IO_ADDR(DDRC)), [portd] "I"(_SFR_IO_ADDR(PORTD)),
-          [all] "M"(PORTC_ALL), [dark] "M"(PORTD_DARK), [flags] "I"(_SFR_IO_ADDR(TIFR1)), [matched] "I"(OCF1B),
+          [all] "M"(PORTC_ALL), [dark] "M"(PORTD_DARK), [flags] "I"(_SFR_IO_ADDR(TIFR1)),
+          [matched] "I"(OCF1B),
           [admux] "i"(_SFR_MEM_ADDR(ADMUX)));
     __asm__ volatile(
         "mov r24, r27" "\n\t"
@@ -165,11 +166,14 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "sbrs r24, %[came]" "\n\t"
         "rjmp sense_next" "\n\t"
         "rjmp sense_receive_next" "\n\t"
-        : : [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [soon] "M"(SOON_CYCLES), [keep] "M"(EVENT_STORE | EVENT_COMPLETE), [out] "i"(&sense_out), [adc] "i"(_SFR_MEM_ADDR(ADCL)),
-          [trigger] "i"(_SFR_MEM_ADDR(OCR1BL)), [slot] "i"(&sense_slot), [matched] "I"(OCF1B), [due] "I"(OCF1A),
+        : : [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [soon] "M"(SOON_CYCLES),
+          [keep] "M"(EVENT_STORE | EVENT_COMPLETE), [out] "i"(&sense_out), [adc] "i"(_SFR_MEM_ADDR(ADCL)),
+          [trigger] "i"(_SFR_MEM_ADDR(OCR1BL)), [slot] "i"(&sense_slot), [matched] "I"(OCF1B),
+          [due] "I"(OCF1A),
           [flags] "I"(_SFR_IO_ADDR(TIFR1)), [match] "i"(_SFR_MEM_ADDR(OCR1AL)), [cycles] "M"(EVENT_CYCLES),
           [now] "i"(_SFR_MEM_ADDR(TCNT1L)), [tail] "i"(&tx_tail), [head] "i"(&tx_head), [ring] "i"(tx_ring),
-          [size] "M"(TX_RING), [state] "i"(_SFR_MEM_ADDR(UCSR0A)), [control] "i"(_SFR_MEM_ADDR(UCSR0B)), [itself] "I"(UDRIE0), [room] "I"(UDRE0), [came] "I"(RXC0),
+          [size] "M"(TX_RING), [state] "i"(_SFR_MEM_ADDR(UCSR0A)), [control] "i"(_SFR_MEM_ADDR(UCSR0B)),
+          [itself] "I"(UDRIE0), [room] "I"(UDRE0), [came] "I"(RXC0),
           [data] "i"(_SFR_MEM_ADDR(UDR0)), [end] "M"(2 * HAL_SECTION_SENSE + 2),
           [mark] "I"(_SFR_IO_ADDR(GPIOR0)));
     __asm__ volatile(
@@ -278,10 +282,13 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "rjmp sense_released" "\n"
         "7:" "\t" "adiw r30, %[channels]" "\n\t"
         "rjmp 5b" "\n\t"
-        : : [portc] "I"(_SFR_IO_ADDR(PORTC)), [ddrc] "I"(_SFR_IO_ADDR(DDRC)), [portd] "I"(_SFR_IO_ADDR(PORTD)),
-          [all] "M"(PORTC_ALL), [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [dark] "M"(PORTD_DARK), [lead] "M"(RELEASE_LEAD_CYCLES - LEAD_LESS_CYCLES), [list_low] "I"(_SFR_IO_ADDR(OCR0A)),
+        : : [portc] "I"(_SFR_IO_ADDR(PORTC)), [ddrc] "I"(_SFR_IO_ADDR(DDRC)),
+          [portd] "I"(_SFR_IO_ADDR(PORTD)),
+          [all] "M"(PORTC_ALL), [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [dark] "M"(PORTD_DARK),
+          [lead] "M"(RELEASE_LEAD_CYCLES - LEAD_LESS_CYCLES), [list_low] "I"(_SFR_IO_ADDR(OCR0A)),
           [list_high] "I"(_SFR_IO_ADDR(OCR0B)), [now] "i"(_SFR_MEM_ADDR(TCNT1L)),
-          [match] "i"(_SFR_MEM_ADDR(OCR1AL)), [fixed] "M"(RELEASE_FIXED_CYCLES - LEAD_LESS_CYCLES), [least] "M"(WAIT_LEAST), [log] "i"(sense_late), [turn] "i"(&sense_turn),
+          [match] "i"(_SFR_MEM_ADDR(OCR1AL)), [fixed] "M"(RELEASE_FIXED_CYCLES - LEAD_LESS_CYCLES),
+          [least] "M"(WAIT_LEAST), [log] "i"(sense_late), [turn] "i"(&sense_turn),
           [any] "I"(offsetof(struct late, any)), [channels] "I"(HAL_CHANNELS),
           [state] "i"(_SFR_MEM_ADDR(UCSR0A)), [came] "I"(RXC0), [alone] "M"(EVENT_ALONE));
     __asm__ volatile(
@@ -337,7 +344,8 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "st Z+, r24" "\n\t"
         : : [trigger] "i"(_SFR_MEM_ADDR(OCR1BL)), [slot] "i"(&sense_slot), [matched] "I"(OCF1B),
           [flags] "I"(_SFR_IO_ADDR(TIFR1)), [base] "i"(&sense_base), [wraps] "i"(&sense_wraps),
-          [current] "i"(&sense_current), [list_low] "I"(_SFR_IO_ADDR(OCR0A)), [list_high] "I"(_SFR_IO_ADDR(OCR0B)),
+          [current] "i"(&sense_current), [list_low] "I"(_SFR_IO_ADDR(OCR0A)),
+          [list_high] "I"(_SFR_IO_ADDR(OCR0B)),
           [plan] "i"(sense_plan), [plan_bytes] "i"(sizeof(struct plan)), [drop] "i"(&sense_drop),
           [turn] "i"(&sense_turn));
     __asm__ volatile(
@@ -396,9 +404,12 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "pop r29" "\n\t"
         "pop r28" "\n\t"
         "rjmp sense_then" "\n\t"
-        : : [seq] "i"(&sense_seq), [left] "i"(&sense_left), [last] "i"(&sense_last), [pause] "i"(&sense_pause),
-          [gap] "i"(sense_gap), [list_next] "i"(&sense_list_next), [out] "i"(&sense_out), [done] "i"(&sense_done),
-          [moment] "I"(_SFR_IO_ADDR(GPIOR1)), [first] "i"(&sense_first), [ground] "M"(ADMUX_GROUND), [drop] "i"(&sense_drop), [turns] "i"(&sense_pauses),
+        : : [seq] "i"(&sense_seq), [left] "i"(&sense_left), [last] "i"(&sense_last),
+          [pause] "i"(&sense_pause),
+          [gap] "i"(sense_gap), [list_next] "i"(&sense_list_next), [out] "i"(&sense_out),
+          [done] "i"(&sense_done),
+          [moment] "I"(_SFR_IO_ADDR(GPIOR1)), [first] "i"(&sense_first), [ground] "M"(ADMUX_GROUND),
+          [drop] "i"(&sense_drop), [turns] "i"(&sense_pauses),
           [back] "M"(offsetof(struct taken, wraps)));
     __asm__ volatile(
         "sense_special:" "\t"
@@ -444,7 +455,9 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         : : [list_next] "i"(&sense_list_next), [moment] "I"(_SFR_IO_ADDR(GPIOR1)),
           [portc] "I"(_SFR_IO_ADDR(PORTC)), [portd] "I"(_SFR_IO_ADDR(PORTD)), [dark] "M"(PORTD_DARK),
           [ddrc] "I"(_SFR_IO_ADDR(DDRC)), [all] "M"(PORTC_ALL), [give_up] "i"(sense_give_up),
-          [wait] "i"(sense_wait), [turn] "i"(&sense_turn), [turns] "M"(sizeof(struct late)), [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [list_low] "I"(_SFR_IO_ADDR(OCR0A)), [list_high] "I"(_SFR_IO_ADDR(OCR0B)));
+          [wait] "i"(sense_wait), [turn] "i"(&sense_turn), [turns] "M"(sizeof(struct late)),
+          [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [list_low] "I"(_SFR_IO_ADDR(OCR0A)),
+          [list_high] "I"(_SFR_IO_ADDR(OCR0B)));
     // The receiver holds no more than comes while a release is waited for.
     __asm__ volatile("sense_receive_first:" "\t"
                      "push r30" "\n\t"

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // UART0 with a ring each way. At 1 Mbaud a byte takes 160 cycles. The receiver bridges two, so it has its
-// interrupt. A gaze frame is sent without one: by the main loop while it has nothing else to do, and by the sensing
-// interrupt before it returns, up to two bytes each of the 18 times a cycle. That saves some 40 cycles a byte, and no
-// release waits. Only when more waits than they can carry do its first bytes go by their own interrupt.
+// interrupt. A gaze frame is sent without one: by the main loop while it has nothing else to do, and by the
+// sensing interrupt before it returns, up to two bytes each of the 18 times a cycle. That saves some 40
+// cycles a byte, and no release waits. Only when more waits than they can carry do its first bytes go by
+// their own interrupt.
 #include "port.h"
 #include "port_serial.h"
 
@@ -55,7 +56,8 @@ ISR(USART_RX_vect, ISR_NAKED)
                      : : [end] "M"(2 * HAL_SECTION_SERIAL + 2), [mark] "I"(_SFR_IO_ADDR(GPIOR0)));
 }
 
-// Sends up to tx_mark, then leaves the rest to the polling. In assembler for the same reason as serial_receive().
+// Sends up to tx_mark, then leaves the rest to the polling. In assembler for the same reason as
+// serial_receive().
 ISR(USART_UDRE_vect, ISR_NAKED)
 {
     __asm__ volatile("push r24" "\n\t"
@@ -188,7 +190,8 @@ uint8_t serial_poll(void)
         carry_out();
     if (rx_tail == rx_head)
         return 0;
-    while (left-- && rx_tail != rx_head && app_listens() && serial_room() >= SG_WIRE_FRAME_MAX && !after_pending) {
+    while (left-- && rx_tail != rx_head && app_listens() && serial_room() >= SG_WIRE_FRAME_MAX
+           && !after_pending) {
         uint16_t zero;
         ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
             zero = zero_ticks;
