@@ -118,7 +118,8 @@ def test_linearity_takes_the_shift_away_before_a_living_eye(
     nano.control.ambient(ambient_na)
     code, data, _ = command_json("linearity", nano.port)
     assert code == 0 and data["kept"]
-    before, after = (np.sqrt(np.mean(np.square(data[f"shift_octaves_{when}"]))) for when in ("before", "after"))
+    shifts = (np.array(data[f"shift_octaves_{when}"]) for when in ("before", "after"))
+    before, after = (np.sqrt(np.mean(shift**2)) for shift in shifts)
     assert before > 0.012 and after < 0.6 * before
     # In the dark the zero shows; in the light it does not matter and is left alone.
     assert data["zero_codes"] == pytest.approx(0.0 if ambient_na else -2.0, abs=0.8)
