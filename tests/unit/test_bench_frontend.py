@@ -376,7 +376,7 @@ def test_every_bar_can_be_missed(bench, key, value):
 
 
 @pytest.mark.parametrize("key, part, value", [
-    ("error_ratio", "room", 1.2), ("error_ratio_250", "sun_gap", 3.1), ("saturated_after", "room", 1), ("valid_250", "sun_gap", 0.7),
+    ("error_ratio_250", "room", 1.2), ("error_ratio_250", "sun_gap", 3.1), ("saturated_after", "room", 1), ("valid_250", "sun_gap", 0.7),
     ("step", "saturated_frames", 6), ("step", "settle_frames", None), ("flash", "spare", 0.09),
     ("irradiance_w_m2", "normal", 101.0)])
 def test_every_bar_of_several_can_be_missed(bench, key, part, value):

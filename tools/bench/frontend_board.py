@@ -15,7 +15,6 @@ from sparsegaze import calibrate, linearity, metrics, store, targets
 from sparsegaze.device import Device
 from sparsegaze.distil import fit_recording
 from sparsegaze.screen import VirtualScreen
-from sparsegaze.sensing import wait_stored
 from sparsegaze.virtual import VirtualNano, locate_vheadset
 from sparsegaze.wire import lib
 
@@ -162,12 +161,8 @@ def _calibrate(seed, light, place, say):
         with Device(nano.port) as device:
             nano.control.motion(False)
             nano.control.set("light", "bright")  # a sheet of white paper, which throws back more than an eye
-            written = device.status().eeprom_writes
             curves = linearity.run(device).report()
             nano.control.set("light", light)
-            wait_stored(device, written, 8.0)
-            device.exposure(auto=True)
-            device.reboot()  # which stores first
             nano.control.motion(True)
         options = {"n_targets": CALIBRATION_TARGETS, "seed": seed, "n_validation": 0}
         done = calibrate.run(nano.port, **options)
@@ -175,6 +170,7 @@ def _calibrate(seed, light, place, say):
     while True:
         vectors = fitted.model.vectors
         with Board(seed, state, light=light) as board:
+            board.frames(0.05)  # the limit is that of the streams that are on
             limit = board.device.settings().rate_limit_hz
             say(f"person {seed}, {light}: {vectors} vectors, {limit} Hz at most")
             if limit >= RATE_HZ or vectors <= LEAST_VECTORS:

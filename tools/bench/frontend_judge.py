@@ -50,10 +50,10 @@ def bars(report):
                 if f"{key}_{light}" in report:
                     most(f"{key}, {light}", report[f"{key}_{light}"], limit, "aim")
         for name, limit in RATIO.items():
-            most(f"error_ratio.{name}, each frame", report["error_ratio"][name], limit)
-            most(f"error_ratio_250.{name}, at 250 Hz", report["error_ratio_250"][name], limit)
-            least(f"valid frames, {name}, at 250 Hz", report["valid_250"][name], VALID)
-            least(f"valid frames, {name}, each frame", report["valid"][name], VALID, "aim")
+            most(f"error_ratio_250.{name}, set to 4 cycles a frame", report["error_ratio_250"][name], limit)
+            most(f"error_ratio.{name}, default setting", report["error_ratio"][name], limit, "aim")
+            least(f"valid frames, {name}, set to 4 cycles a frame", report["valid_250"][name], VALID)
+            least(f"valid frames, {name}, default setting", report["valid"][name], VALID, "aim")
             most(f"saturated frames after the first 5, {name}", report["saturated_after"][name], 0)
         most("step.saturated_frames", report["step"]["saturated_frames"], STEP_SATURATED)
         most("step.settle_frames", report["step"]["settle_frames"], STEP_SETTLE)
