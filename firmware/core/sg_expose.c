@@ -11,6 +11,7 @@ enum {
     FALL_LEAST_Q2 = 8,          // of a peak, below which a fall says nothing
     CAUTION_MOST = 6,
     ACQUIRED_A_CYCLE = 2,
+    LEAST_MOST = 1024,          // a port that takes more instead has other reasons
     SOON_LOOKS = 32,            // 0.2 s
     WATCH_LOOKS = 5,            // 30 ms: five phases of a period of 10 ms
     SLOW_ROUNDS = 170,          // 1 s at 6 ms a round
@@ -40,8 +41,19 @@ void sg_expose_start(struct sg_expose *expose, const uint16_t exposure_cycles[6]
 
 void sg_expose_taken(struct sg_expose *expose, const uint16_t exposure_cycles[6])
 {
-    for (uint8_t i = 0; i < CHANNELS; i++)
-        expose->led[i].exposure_cycles = exposure_cycles[i];
+    for (uint8_t i = 0; i < CHANNELS; i++) {
+        struct sg_expose_led *led = &expose->led[i];
+        const uint16_t asked = led->exposure_cycles, taken = exposure_cycles[i];
+        if (taken > asked + (asked >> 2) && taken <= LEAST_MOST)
+            led->least_q4 = (uint8_t)(taken >> 4);
+        led->exposure_cycles = taken;
+    }
+}
+
+static uint16_t within(const struct sg_expose_led *led, uint16_t cycles)
+{
+    const uint16_t least = (uint16_t)(led->least_q4 << 4);
+    return clipped(cycles < least ? least : cycles, led->most_cycles);
 }
 
 // 64 * SG_EXPOSE_GOAL_CODES / load, rounded down; a load of 8 codes or more.
@@ -66,7 +78,7 @@ static uint16_t wanted(const struct sg_expose_led *led, uint16_t unlit, uint16_t
 {
     const uint32_t cycles = ((uint32_t)led->exposure_cycles * stretch_q6((uint16_t)(unlit + 2U * signal))) >> 6;
     const uint16_t whole = cycles > UINT16_MAX >> 3 ? UINT16_MAX >> 3 : (uint16_t)cycles;
-    return clipped((uint16_t)(whole - ((uint16_t)(whole * led->caution) >> 3)), led->most_cycles);
+    return within(led, (uint16_t)(whole - ((uint16_t)(whole * led->caution) >> 3)));
 }
 
 // Take an exposure. Returns 1 if it is another one.
@@ -86,7 +98,7 @@ static uint8_t change(struct sg_expose_led *led, uint16_t exposure_cycles, uint8
 static uint8_t full(struct sg_expose_led *led, uint16_t unlit, uint16_t then_cycles)
 {
     const uint8_t shift = unlit >= SG_EXPOSE_SATURATED_CODE ? 4 : 3;
-    const uint16_t now = clipped(then_cycles >> shift, led->most_cycles);
+    const uint16_t now = within(led, then_cycles >> shift);
     if (now >= led->exposure_cycles)
         return 0;
     if (led->stage == SG_EXPOSE_ACQUIRE || led->age >= SOON_LOOKS)
@@ -183,11 +195,17 @@ static uint8_t is_full(uint16_t lit, uint16_t unlit)
 static uint8_t at_once(struct sg_expose *expose, const uint16_t lit_code[6], const uint16_t unlit_code[6],
                        const uint16_t exposure_cycles[6])
 {
-    uint8_t changed = 0, acquired = 0, left = 0;
+    uint8_t changed = 0, acquired = 0, left = 0, drowned = 0;
+    for (uint8_t i = 0; i < CHANNELS; i++)
+        drowned = (uint8_t)(drowned + (unlit_code[i] >= SG_EXPOSE_SATURATED_CODE));
     struct sg_expose_led *led = expose->led;
     for (uint8_t i = 0; i < CHANNELS; i++, led++) {
         const uint16_t lit = lit_code[i], unlit = unlit_code[i];
-        if (is_full(lit, unlit)) {
+        // Two full without our light: so much of it came that the others will be, and all change at once.
+        if (drowned >= 2 && exposure_cycles[i] == led->exposure_cycles && led->stage == SG_EXPOSE_TRACK
+            && led->age >= SOON_LOOKS) {
+            changed |= full(led, SG_EXPOSE_SATURATED_CODE, exposure_cycles[i]);
+        } else if (is_full(lit, unlit)) {
             changed |= full(led, unlit, exposure_cycles[i]);
         } else if (led->stage <= SG_EXPOSE_REFINE && acquired < ACQUIRED_A_CYCLE
                    && exposure_cycles[i] == led->exposure_cycles) {

@@ -39,7 +39,7 @@ struct sg_expose_led {
     int8_t streak;              // looks in a row that were too bright (> 0) or too dim (< 0)
     uint8_t caution;            // eighths taken off the goal since exposures chosen of late were full soon after
     uint8_t age;                // looks since the exposure changed, up to 255
-    uint8_t reserved;
+    uint8_t least_q4;           // the port takes no less than this, / 16 cycles, as far as is known
 };
 
 enum sg_expose_stage {
@@ -62,7 +62,8 @@ struct sg_expose {
 // sg_expose_taken.
 void sg_expose_start(struct sg_expose *expose, const uint16_t exposure_cycles[6], const uint16_t most_cycles[6]);
 
-// What the port made of the exposures asked for: it may move them by a few per cent. Call after every change.
+// What the port made of the exposures asked for: it may move them by a few per cent, and refuse short ones (what is
+// taken instead is then the least). Call after every change.
 void sg_expose_taken(struct sg_expose *expose, const uint16_t exposure_cycles[6]);
 
 // One cycle: a look at the next channel; at once at those that are full (an eighth of the exposure, a sixteenth if

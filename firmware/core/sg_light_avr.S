@@ -386,6 +386,10 @@ moves:
 meant:                          ; r19:r18 lit, r23:r22 unlit as meant
     mov r27, r19                ; less what the rail does
     lsr r27
+    mov r26, r19
+    swap r26
+    cbr r26, 0xF0
+    add r27, r26
     and r27, rail
     sub r18, r27
     sbc r19, zero

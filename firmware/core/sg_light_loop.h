@@ -18,9 +18,6 @@ enum {
     SG_LIGHT_RESTING_BELOW = 640,
     SG_LIGHT_MOVING_MOST = 4096,
     SG_LIGHT_DEPARTURE_MOST = 63,
-    // Lit emitters lift the rail, a junction biased more holds less: of the lit code, 2^-9 (0.3 ohm, 4 emitters of
-    // 20 mA: 24 mV). Emitters of photodiodes do not flow through it.
-    SG_LIGHT_RAIL_SHIFT = 9,
     SG_LIGHT_GAP = 1,
     SG_LIGHT_BEGINS = 2,
     SG_LIGHT_MOVES = 4,

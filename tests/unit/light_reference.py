@@ -9,6 +9,7 @@ import numpy as np
 from sparsegaze._core import ffi, lib
 
 RAIL_V, REFERENCE_V = 1.8, 1.1
+LIT_RAIL_V = RAIL_V + 0.3 * 4 * 0.020   # four emitters of 20 mA lift it
 JUNCTION_PF, JUNCTION_V, POWER = 40.0, 0.7, 0.4
 PIN_PF, SAMPLE_PF = 6.0, 14.0
 UNIT_NA = 0.0625
@@ -17,30 +18,31 @@ PAIRS = {lib.SG_WIRING_LEDS: ((5, 0), (1, 4), (2, 3)), lib.SG_WIRING_PHOTODIODES
 NOISE_LSB = 0.7 * (1 + 1.25 * 50 / 800)
 SLOTS, LIT_TO_UNLIT_SLOTS = 18, 3
 CLOCK_HZ = 16e6
+GAUSS = np.polynomial.legendre.leggauss(5)[::-1]
 SUN_NA, ROOM_NA, BRIGHT_ROOM_NA = 2000.0, 20.0, 200.0
 CAPS = (1656, 2544)                     # longest exposures at the shortest period: first and second of a pair
 
 
-def junction_pc(volts):
+def junction_pc(volts, rail=RAIL_V):
     """Charge that lifts the junction from 0 V, pC."""
     def at(reverse):
         return JUNCTION_PF * JUNCTION_V / (1 - POWER) * (1 + reverse / JUNCTION_V) ** (1 - POWER)
-    return at(RAIL_V) - at(RAIL_V - volts)
+    return at(rail) - at(rail - volts)
 
 
-def node_pc(code, before=0.0):
+def node_pc(code, before=0.0, rail=RAIL_V):
     """Charge collected by a node that reads `code` when the sample capacitor came from `before`, pC."""
     volts = REFERENCE_V * np.asarray(code, float) / 1024
-    return junction_pc(volts) + (PIN_PF + SAMPLE_PF) * volts - SAMPLE_PF * REFERENCE_V * np.asarray(before, float) / 1024
+    return junction_pc(volts, rail) + (PIN_PF + SAMPLE_PF) * volts - SAMPLE_PF * REFERENCE_V * np.asarray(before, float) / 1024
 
 
-_CODES = np.linspace(-300, 2100, 24001)
-_CHARGE = node_pc(_CODES)
+_CODES = np.linspace(-300, 1900, 22001)
+_CHARGE = {rail: node_pc(_CODES, 0.0, rail) for rail in (RAIL_V, LIT_RAIL_V)}
 
 
-def read(charge_pc, before=0.0):
+def read(charge_pc, before=0.0, rail=RAIL_V):
     """The code, unrounded, of a collected charge; the inverse of node_pc (error below 1e-5 of a code)."""
-    return np.interp(charge_pc + SAMPLE_PF * REFERENCE_V * before / 1024, _CHARGE, _CODES)
+    return np.interp(charge_pc + SAMPLE_PF * REFERENCE_V * before / 1024, _CHARGE[rail], _CODES)
 
 
 def collected_pc(current_na, cycles):
@@ -75,9 +77,9 @@ class Board:
     """
 
     def __init__(self, signal_na, ambient_na=0.0, exposure=None, wiring=lib.SG_WIRING_LEDS, period=15984,
-                 noise_lsb=0.0, offset_lsb=0.0, seed=1, whole_codes=True):
+                 noise_lsb=0.0, offset_lsb=0.0, seed=1):
         self.signal, self.ambient, self.wiring, self.period = signal_na, ambient_na, wiring, period
-        self.noise_lsb, self.offset_lsb, self.whole = noise_lsb, offset_lsb, whole_codes
+        self.noise_lsb, self.offset_lsb = noise_lsb, offset_lsb
         self.rng, self.k, self.start = np.random.default_rng(seed), 0, 0.0
         self.exposure = np.zeros(6, int)
         for first, second in PAIRS[wiring]:
@@ -85,21 +87,20 @@ class Board:
         if exposure is not None:
             self.exposure = np.broadcast_to(np.asarray(exposure), 6).astype(int).copy()
 
-    def _light(self, seconds):
-        value = self.ambient(seconds) if callable(self.ambient) else self.ambient
-        return np.broadcast_to(np.asarray(value, float), 6)
-
-    def _code(self, charge_pc, before):
-        volts_code = read(charge_pc, before)
-        seen = volts_code + self.offset_lsb + self.noise_lsb * self.rng.standard_normal()
-        return volts_code, int(np.clip(np.floor(seen + 0.5), 0, 1023))
-
-    def _ambient_pc(self, i, end_s, cycles):
-        """Ambient charge of one exposure that ends at end_s: seven-point Gauss rule."""
-        nodes, weights = np.polynomial.legendre.leggauss(7)
+    def _ambient_pc(self, end_s, cycles):
+        """Ambient charge of exposures that end at end_s, both arrays of 6: five-point Gauss rule."""
+        if not callable(self.ambient):
+            return np.broadcast_to(np.asarray(self.ambient, float), 6) * cycles / CLOCK_HZ * 1e3
         length = cycles / CLOCK_HZ
-        times = end_s - length / 2 + nodes * length / 2
-        return sum(w * self._light(t)[i] for w, t in zip(weights, times)) / 2 * length * 1e3
+        total = np.zeros(6)
+        for weight, node in zip(*GAUSS):
+            times = end_s + (node - 1) * length / 2
+            total += weight / 2 * np.array([self.ambient(times[i])[i] for i in range(6)])
+        return total * length * 1e3
+
+    def _seen(self, volts_code):
+        seen = volts_code + self.offset_lsb + self.noise_lsb * self.rng.standard_normal(3)
+        return np.clip(np.floor(seen + 0.5), 0, 1023).astype(int)
 
     def cycle(self, late_lit=0, late_unlit=0, held=0, gap_cycles=0):
         """One struct sg_reading; late_*: cycles per channel by which the releases came late."""
@@ -107,21 +108,26 @@ class Board:
         signal = self.signal(self.k) if callable(self.signal) else self.signal
         signal = np.broadcast_to(np.asarray(signal, float), 6)
         slot = self.period / SLOTS / CLOCK_HZ
-        out = ffi.new("struct sg_reading *", {"held_code": held})
-        for phase, pair in enumerate(PAIRS[self.wiring]):
-            volts = {"lit": float(held) if phase == 0 else 0.0, "unlit": 0.0}
-            for place, i in enumerate(pair):
-                for kind, late, lag in (("lit", late_lit[i], 0), ("unlit", late_unlit[i], LIT_TO_UNLIT_SLOTS)):
-                    end = self.start + slot * (6 * phase + 1 + place + lag)
-                    cycles = self.exposure[i] - int(late)
-                    charge = self._ambient_pc(i, end, cycles)
-                    if kind == "lit":
-                        charge += collected_pc(signal[i], cycles)
-                    volts[kind], code = self._code(charge, volts[kind])
-                    getattr(out, f"{kind}_code")[i] = code
-                out.exposure_cycles[i] = int(self.exposure[i])
-                out.late_lit_cycles[i] = min(int(late_lit[i]), 255)
-                out.late_unlit_cycles[i] = min(int(late_unlit[i]), 255)
+        first, second = np.array(PAIRS[self.wiring]).T
+        place = np.zeros(6)
+        place[first], place[second] = 6 * np.arange(3) + 1, 6 * np.arange(3) + 2
+        codes = {}
+        for kind, late, lag in (("lit", late_lit, 0), ("unlit", late_unlit, LIT_TO_UNLIT_SLOTS)):
+            cycles = self.exposure - late
+            charge = self._ambient_pc(self.start + slot * (place + lag), cycles)
+            rail = RAIL_V
+            if kind == "lit":
+                charge = charge + collected_pc(signal, cycles)
+                rail = LIT_RAIL_V if self.wiring == lib.SG_WIRING_LEDS else RAIL_V
+            before = np.array([held if kind == "lit" else 0, 0, 0])
+            volts = read(charge[first], before, rail)
+            codes[kind] = np.zeros(6, int)
+            codes[kind][first] = self._seen(volts)
+            codes[kind][second] = self._seen(read(charge[second], volts, rail))
+        out = ffi.new("struct sg_reading *", {
+            "lit_code": codes["lit"].tolist(), "unlit_code": codes["unlit"].tolist(), "held_code": held,
+            "exposure_cycles": self.exposure.tolist(), "late_lit_cycles": np.minimum(late_lit, 255).tolist(),
+            "late_unlit_cycles": np.minimum(late_unlit, 255).tolist()})
         self.k += 1
         self.start += (self.period + gap_cycles) / CLOCK_HZ
         return out

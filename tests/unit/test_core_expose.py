@@ -221,6 +221,18 @@ def test_a_sample_of_an_older_exposure_does_not_correct_twice():
     assert [led.exposure_cycles for led in state.led] == once
 
 
+def test_a_port_s_least_exposure_is_learnt_and_not_asked_to_be_less():
+    state = ffi.new("struct sg_expose *")
+    lib.sg_expose_start(state, MOST, MOST)
+    full = [1023] * 6
+    assert lib.sg_expose_cycle(state, full, full, MOST)
+    taken = [max(208, led.exposure_cycles) for led in state.led]
+    lib.sg_expose_taken(state, taken)
+    for _ in range(50):
+        assert not lib.sg_expose_cycle(state, full, full, taken)
+    assert [led.exposure_cycles for led in state.led] == taken
+
+
 def test_start_clips_and_any_codes_keep_the_limits():
     rng = np.random.default_rng(1)
     state = ffi.new("struct sg_expose *")

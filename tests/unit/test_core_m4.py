@@ -11,7 +11,7 @@ from sparsegaze import qemu
 from sparsegaze._core import ffi, lib
 from sparsegaze.device import Device
 from sparsegaze.errors import NoDeviceError
-from test_core_avr import READINGS, gaze_bytes
+from test_core_avr import READINGS, exposure_bytes, gaze_bytes
 from test_core_gp import GOLDEN_CRC, golden_case
 from test_core_negative import FAULTS
 
@@ -42,14 +42,18 @@ def test_random_models_are_bit_identical(tmp_path, d, n):
     assert infer(tmp_path, parts, feature).output.tobytes() == gaze_bytes(parts, feature)
 
 
-def test_features_from_codes_and_exposures_are_bit_identical(tmp_path):
-    rows = np.array([code + cycles for code, cycles in READINGS], np.uint16)
-    result = m4.run_cases(tmp_path, "((uint8_t *)out)[12] = sg_track_features((const uint16_t *)in, "
-                          "(const uint16_t *)in + 6, (uint16_t *)out);", rows, 13, ["sg_track.h"])
-    for (code, cycles), out in zip(READINGS, result.output):
-        feature = ffi.new("uint16_t[6]")
-        flags = lib.sg_track_features(code, cycles, feature)
-        assert out.tobytes() == bytes(ffi.buffer(feature)) + bytes([flags])
+def test_features_and_exposures_of_readings_are_bit_identical(tmp_path):
+    rows = np.array([lit + [code >> 2 for code in lit] + exposure for lit, exposure in READINGS], np.uint16)
+    result = m4.run_cases(
+        tmp_path, "struct sg_reading reading = { .held_code = 0 }; uint16_t feature[6]; memcpy(&reading, in, 36);"
+        "sg_light_add(&light, &reading); out[0] = sg_light_features(&light, feature); memcpy(out + 1, feature, 12);"
+        "sg_expose_cycle(&expose, reading.lit_code, reading.unlit_code, reading.exposure_cycles);"
+        "for (int i = 0; i < 6; i++) memcpy(out + 13 + 2 * i, &expose.led[i].exposure_cycles, 2);",
+        rows, 25, ["sg_expose.h", "sg_light.h"],
+        setup="static struct sg_light light; static struct sg_expose expose; "
+              "const uint16_t most[6] = { 2544, 1656, 1656, 2544, 2544, 1656 };"
+              "sg_light_start(&light, 0, 15984); sg_expose_start(&expose, most, most);")
+    assert result.output.tobytes() == exposure_bytes()
 
 
 def test_the_counter_counts_every_instruction(tmp_path):

@@ -8,9 +8,9 @@ import pytest
 from core_models import Parts, View, features_near, random_parts, scaled, twin
 from sparsegaze._core import ffi, lib
 
-RAW_FLAGS = (lib.SG_FLAG_SATURATED, lib.SG_FLAG_STARVED, lib.SG_FLAG_EXPOSURE, lib.SG_FLAG_TRIAL,
+RAW_FLAGS = (lib.SG_FLAG_SATURATED, lib.SG_FLAG_STARVED, lib.SG_FLAG_EXPOSURE, lib.SG_FLAG_FAULT,
              lib.SG_FLAG_RECOVERING)
-BAD_FLAGS = lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_RECOVERING
+BAD_FLAGS = lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_FAULT | lib.SG_FLAG_RECOVERING
 
 
 def plain(bias_deg_q7=(0, 0)):
@@ -97,13 +97,12 @@ def test_batch_equals_single_frames_and_the_twin():
             not outside[i] and not raw[i] & BAD_FLAGS and single[0] == lib.SG_OK)
 
 
-def test_features_of_a_frame_are_those_of_its_channels_with_flags_joined():
-    code, cycles = [2000, 1184, 4080, 2801, 1185, 4064], [256, 4864, 1000, 4864, 300, 2000]
-    out, one = ffi.new("uint16_t[6]"), ffi.new("uint16_t *")
-    flags = lib.sg_track_features(code, cycles, out)
-    joined = 0
-    for i in range(6):
-        joined |= lib.sg_expose_feature(code[i], cycles[i], one)
-        assert one[0] == out[i]
-    assert flags == joined == lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED
-    assert lib.sg_track_features([2000] * 6, cycles, out) == 0
+def test_the_calibrated_range_is_what_the_model_says_channel_by_channel():
+    rng = np.random.default_rng(6)
+    parts = random_parts(rng, 10, guards=1)
+    view, sight = View(parts.image()), ffi.new("struct sg_health_sight *")
+    for channel in range(6):
+        lib.sg_track_range(view.view, channel, sight)
+        assert (sight.offset, sight.gain_q12) == (parts.offset[channel], parts.gain_q12[channel])
+    lib.sg_track_range(ffi.NULL, 3, sight)
+    assert (sight.offset, sight.gain_q12) == (0, 0)

@@ -10,6 +10,7 @@
 
 #include "case_data.h"
 #include "sg_expose.h"
+#include "sg_light.h"
 #include "sg_link.h"
 #include "sg_model.h"
 #include "sg_track.h"
@@ -67,24 +68,30 @@ static void predict(struct sg_gaze *gaze)
 
 static void expose(void)
 {
-    struct sg_expose_led led[6];
-    for (uint8_t i = 0; i < 6; i++)
-        sg_expose_start(&led[i], SG_EXPOSE_START_CYCLES);
+    static struct sg_light light;
+    static struct sg_expose exposures;
+    const uint16_t most[6] = { 2544, 1656, 1656, 2544, 2544, 1656 };
+    sg_light_start(&light, 0, 15984);
+    sg_expose_start(&exposures, most, most);
     for (uint16_t i = 0; i < CASE_READINGS; i++) {
-        uint16_t code[6], exposure_cycles[6], feature[6];
-        memcpy_P(code, case_code[i], sizeof code);
-        memcpy_P(exposure_cycles, case_exposure[i], sizeof exposure_cycles);
+        struct sg_reading reading;
+        uint16_t feature[6];
+        memset(&reading, 0, sizeof reading);
+        memcpy_P(reading.lit_code, case_code[i], sizeof reading.lit_code);
+        memcpy_P(reading.exposure_cycles, case_exposure[i], sizeof reading.exposure_cycles);
+        for (uint8_t j = 0; j < 6; j++)
+            reading.unlit_code[j] = reading.lit_code[j] >> 2;
         BEGIN(FEATURES);
-        const uint8_t flags = sg_track_features(code, exposure_cycles, feature);
+        sg_light_add(&light, &reading);
+        const uint8_t flags = sg_light_features(&light, feature);
         END(FEATURES);
         BEGIN(EXPOSE);
-        for (uint8_t j = 0; j < 6; j++)
-            sg_expose_step(&led[j], code[j], exposure_cycles[j]);
+        sg_expose_cycle(&exposures, reading.lit_code, reading.unlit_code, reading.exposure_cycles);
         END(EXPOSE);
         put(&flags, 1);
         put(feature, sizeof feature);
         for (uint8_t j = 0; j < 6; j++)
-            put(&led[j].exposure_cycles, 2);
+            put(&exposures.led[j].exposure_cycles, 2);
     }
 }
 
