@@ -42,8 +42,9 @@ def bars(report):
         most("* lost frames", report["lost"], 0)
         most("* truth error of the model over the full process's", report["truth_ratio"], TRUTH_RATIO)
         least("* n_vectors", report["n_vectors"], VECTORS_AIM, "aim")
-        most("* latency_mean_ms, from the mean sample time", report["latency_mean_max_ms"], LATENCY_MEAN_MS)
-        most("* latency_last_ms, from the last sample", report["latency_last_max_ms"], LATENCY_LAST_MS)
+        for key, limit in (("latency_mean", LATENCY_MEAN_MS), ("latency_last", LATENCY_LAST_MS)):
+            most(f"* {key}_ms, from the {key[8:]} sample (time) to the last byte", report[key + "_ms"], limit)
+            most(f"* {key}_max_ms, of all frames", report[key + "_max_ms"], limit, "aim")
         for key, limit in (("s2s_deg", S2S_DEG), ("s2s_250_deg", S2S_250_DEG)):
             most(f"* {key}, nominal", report[key], limit)
             for light in ("dim", "bright"):

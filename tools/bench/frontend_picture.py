@@ -34,6 +34,8 @@ def draw(path, report):
         import frontend_panels
 
         panels += frontend_panels.PANELS
+    if report.get("safety"):
+        panels.append(_safety)
     if not panels:
         return
     columns = min(3, len(panels))
@@ -71,7 +73,8 @@ def _line(axis, rows, colour, label):
 
 def _bits_axis(axis, title):
     axis.set(xscale="log", xlabel="exposure (us)", ylabel="effective bits (random noise)", title=title, ylim=(0, 9.5))
-    axis.set_xticks(frontend_methods.EXPOSURES_US, labels=[str(t) for t in frontend_methods.EXPOSURES_US], fontsize=7)
+    shown = [t for t in frontend_methods.EXPOSURES_US if t not in (103, 159)]
+    axis.set_xticks(shown, labels=[str(t) for t in shown], fontsize=7)
     axis.minorticks_off()
     axis.grid(alpha=0.3)
     axis.legend(fontsize=7, loc="upper left")
@@ -142,3 +145,16 @@ def _patterns(axis, report):
     axis.set(xlabel="RMS-S2S (deg), simulated persons", title="Who emits while who senses", xlim=(0, 1.5))
     axis.invert_yaxis()
     axis.legend(fontsize=7)
+
+
+def _safety(axis, report):
+    """How far each quantity is from its limit, in every case."""
+    rows = [row for row in report["safety"]["rows"] if row["margin"]]
+    place = np.arange(len(rows))
+    colours = {"normal": GREEN, "any command": BLUE, "any fault": ORANGE}
+    axis.barh(place, [row["margin"] for row in rows], color=[colours.get(row["case"], GREY) for row in rows])
+    axis.axvline(1.0, color=RED, ls="--", lw=1)
+    axis.set_yticks(place, labels=[f"{row['case']}: {row['quantity']}" for row in rows], fontsize=7)
+    axis.set(xscale="log", xlabel="limit over value", title="IEC 62471, exempt group (dashed: the limit)")
+    axis.set_xlim(0.5, None)
+    axis.invert_yaxis()
