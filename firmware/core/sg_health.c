@@ -4,6 +4,7 @@
 enum {
     CHANNELS = 6,
     OCTAVE = 4096,
+    NEAR = OCTAVE >> 1,
     RANGE_STEPS = 4096,         // of the calibrated range
     // A node without an LED has the pin's 6 pF and takes 14 of 20 parts of what the sample capacitor held: 7/10 of
     // the code before. It follows that code even as it moves, which no LED does.
@@ -68,9 +69,9 @@ static uint8_t optical(const struct sg_health_sight *sight)
         return 0;
     if ((int32_t)sight->feature + OCTAVE < (int32_t)sight->offset)
         return SG_HEALTH_LOW;
-    if ((int32_t)sight->feature - OCTAVE < (int32_t)sight->offset)
+    if ((int32_t)sight->feature - NEAR < (int32_t)sight->offset)
         return 0;
-    const uint32_t above = (uint32_t)(sight->feature - sight->offset - OCTAVE) * sight->gain_q12;
+    const uint32_t above = (uint32_t)(sight->feature - sight->offset - NEAR) * sight->gain_q12;
     return above >> 12 >= RANGE_STEPS ? SG_HEALTH_HIGH : 0;
 }
 

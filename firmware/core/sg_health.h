@@ -13,13 +13,13 @@ enum sg_health_fault {
     SG_HEALTH_OPEN = 1,         // no current at all, lit or not, at the longest exposure
     SG_HEALTH_SHORT = 2,        // full at the shortest exposure, lit or not
     SG_HEALTH_LOW = 4,          // an octave or more below the calibrated range
-    SG_HEALTH_HIGH = 8,         // an octave or more above it
+    SG_HEALTH_HIGH = 8,         // half an octave or more above it
 };
 enum sg_health_limits {
     SG_HEALTH_PATIENCE = 6,             // looks at a channel: 0.29 s at 48 ms a look
     SG_HEALTH_NOTHING_CODE = 4,         // at and below, lit and unlit, nothing came
     SG_HEALTH_FULL_CODE = 1000,
-    SG_HEALTH_SHORT_CYCLES = 128,       // full even at this exposure
+    SG_HEALTH_SHORT_CYCLES = 256,       // full even at this exposure: no port's least is longer
 };
 
 // One channel in one cycle.

@@ -11,18 +11,18 @@ enum { LATE_UNKNOWN = 255 };
 const uint8_t sg_light_order[2][6] SG_ROM = { { 5, 0, 1, 4, 2, 3 }, { 0, 3, 1, 4, 2, 5 } };
 
 // Upper half of a product.
-static inline int16_t high(int16_t x, int16_t y)
+static int16_t high(int16_t x, int16_t y)
 {
     return (int16_t)(((int32_t)x * y) >> 16);
 }
 
 // Q0.8 of a difference, rounded down.
-static inline int16_t by_q8(int16_t x, uint8_t weight_q8)
+static int16_t by_q8(int16_t x, uint8_t weight_q8)
 {
     return (int16_t)(((int32_t)x * weight_q8) >> 8);
 }
 
-static inline uint16_t size_of(int16_t x)
+static uint16_t size_of(int16_t x)
 {
     return (uint16_t)(x < 0 ? -x : x);
 }

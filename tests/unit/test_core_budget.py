@@ -16,10 +16,12 @@ from budget import judge, judge_all, read
 from core_footprint import footprint
 from core_models import Parts
 from mlp_models import inputs_near, random_model
+from sparsegaze._core import ffi, lib
 
 AVR, CORTEX_M4 = "atmega328p", "cortex-m4-instructions"
 # The AVR compiler is pinned by requirements.txt; the other is Debian's, whatever it is there.
 M4_COMPILER, OTHER_COMPILER_MARGIN = "12.2", 0.3
+EXPOSURES = [2544, 1656, 1656, 2544, 2544, 1656]
 RUN = {AVR: core_avr_cases.run_cases, CORTEX_M4: m4.run_cases}
 
 
@@ -52,15 +54,52 @@ def mlp_case():
             "data": {"image": model.image}}
 
 
-def feature_case():
-    """Readings of every size: bright and dark, short and long exposures."""
+def light_case():
+    """Ordinary cycles, the costliest: light that moves, interpolated, the state settled before, on the host."""
     rng = np.random.default_rng(4)
-    code = rng.integers(0, 4093, (40, 6))
-    exposure = rng.integers(256, 4865, (40, 6))
-    return {"body": "out[12] = sg_track_features((const uint16_t *)in, (const uint16_t *)in + 6, "
-                    "(uint16_t *)out);",
-            "inputs": np.concatenate([code, exposure], axis=1).astype(np.uint16), "out_bytes": 13,
-            "includes": ["sg_track.h"]}
+    wave = np.round(150 + 15 * np.sin(0.69 * np.arange(80)))[:, None]
+    codes = np.concatenate([wave + rng.integers(150, 600, (80, 6)), wave + rng.integers(-1, 2, (80, 6)),
+                            np.tile(EXPOSURES, (80, 1)), np.zeros((80, 7))], axis=1).astype(np.uint16)
+    light, feature = ffi.new("struct sg_light *"), ffi.new("uint16_t[6]")
+    lib.sg_light_start(light, lib.SG_WIRING_LEDS, 15984)
+    for row in codes[:40]:
+        reading = ffi.new("struct sg_reading *")
+        ffi.memmove(reading, row.tobytes(), 50)
+        lib.sg_light_add(light, reading)
+        lib.sg_light_features(light, feature)
+    return {"body": "struct sg_reading reading; memcpy(&reading, in, sizeof reading); sg_light_add(&light, &reading);"
+                    "uint16_t feature[6]; out[12] = sg_light_features(&light, feature); memcpy(out, feature, 12);",
+            "inputs": codes[40:], "out_bytes": 13, "includes": ["sg_light.h", "sg_rom.h"],
+            "setup": "static struct sg_light light; for (uint8_t k = 0; k < sizeof light; k++)"
+                     "    ((uint8_t *)&light)[k] = sg_rom_byte(&settled[k], CASE_SPACE);",
+            "data": {"settled": bytes(ffi.buffer(light))}}
+
+
+def expose_case():
+    """Ordinary cycles: nothing full, nothing to acquire."""
+    rng = np.random.default_rng(5)
+    codes = np.concatenate([rng.integers(300, 350, (60, 6)), rng.integers(2, 9, (60, 6)), np.tile(EXPOSURES, (60, 1))],
+                           axis=1)
+    expose = ffi.new("struct sg_expose *")
+    lib.sg_expose_start(expose, EXPOSURES, EXPOSURES)
+    for _ in range(20):
+        lib.sg_expose_cycle(expose, [320] * 6, [5] * 6, EXPOSURES)
+    return {"body": "uint16_t code[18]; memcpy(code, in, 36);"
+                    "out[0] = sg_expose_cycle(&expose, code, code + 6, code + 12);",
+            "inputs": codes.astype(np.uint16), "out_bytes": 1, "includes": ["sg_expose.h", "sg_rom.h"],
+            "setup": "static struct sg_expose expose; for (uint8_t k = 0; k < sizeof expose; k++)"
+                     "    ((uint8_t *)&expose)[k] = sg_rom_byte(&settled[k], CASE_SPACE);",
+            "data": {"settled": bytes(ffi.buffer(expose))}}
+
+
+def health_case():
+    """Looks at sound channels and at faulty ones."""
+    rows = [[lit, 3, 380, 1656, 1656, feature, 40000, 2048] for lit in (0, 266, 400, 1023)
+            for feature in (30000, 42000, 64000)]
+    return {"body": "struct sg_health_sight sight; memcpy(&sight, in, sizeof sight);"
+                    "out[0] = sg_health_look(&health, 3, &sight);",
+            "inputs": np.array(rows * 4, np.uint16), "out_bytes": 1, "includes": ["sg_health.h"],
+            "setup": "static struct sg_health health; sg_health_start(&health);"}
 
 
 def packet_case():
@@ -76,7 +115,8 @@ def packet_case():
 # function: the case that runs it
 FUNCTIONS = {
     "sg_track_infer": gp_case, "sg_gp_predict": gp_case, "sg_gp_loop": gp_case, "sg_gp_judge": gp_case,
-    "sg_model_open": gp_case, "sg_track_features": feature_case, "sg_wire_encode": packet_case,
+    "sg_model_open": gp_case, "sg_light_add": light_case, "sg_light_features": light_case,
+    "sg_expose_cycle": expose_case, "sg_health_look": health_case, "sg_wire_encode": packet_case,
     "sg_wire_decode": packet_case, "sg_mlp_predict": mlp_case}
 
 

@@ -33,7 +33,7 @@ FAULTS = {
     "open": (lib.SG_FAULT_OPEN, {"lit_code": 2, "unlit_code": 1}),
     "short": (lib.SG_FAULT_SHORT, {"lit_code": 1023, "unlit_code": 1023, "exposure_cycles": 64}),
     "covered": (lib.SG_FAULT_LOW, {"feature": OFFSET - OCTAVE - 1}),
-    "finger": (lib.SG_FAULT_HIGH, {"feature": OFFSET + 8192 + OCTAVE}),
+    "finger": (lib.SG_FAULT_HIGH, {"feature": OFFSET + 8192 + OCTAVE // 2}),
 }
 
 
@@ -58,7 +58,7 @@ def test_what_does_not_last_is_no_fault(name):
 
 @pytest.mark.parametrize("kind,changed", {
     "an octave below, not more": {"feature": OFFSET - OCTAVE},
-    "an octave above, not more": {"feature": OFFSET + 8191 + OCTAVE - 1},
+    "half an octave above, not more": {"feature": OFFSET + 8191 + OCTAVE // 2 - 1},
     "no model": {"feature": 0, "gain_q12": 0, "offset": 0},
     "dark but short exposed": {"lit_code": 1, "unlit_code": 1, "exposure_cycles": 64},
     "dark with leakage": {"lit_code": 6, "unlit_code": 5},
@@ -75,9 +75,9 @@ def test_the_end_of_the_feature_range_overflows_nothing():
         for feature in (0, 1, 4095, 4096, 32768, 65535):
             health = Health()
             found = health.look(PATIENCE, offset=offset, gain_q12=gain, feature=feature)[-1]
-            above = ((feature - offset - OCTAVE) * gain) >> 12
+            above = ((feature - offset - OCTAVE // 2) * gain) >> 12
             expected = lib.SG_FAULT_LOW if feature + OCTAVE < offset else \
-                lib.SG_FAULT_HIGH if feature - offset >= OCTAVE and above >= 4096 else 0
+                lib.SG_FAULT_HIGH if feature - offset >= OCTAVE // 2 and above >= 4096 else 0
             assert found == expected, (offset, gain, feature)
 
 
