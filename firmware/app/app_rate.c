@@ -7,14 +7,14 @@
 
 // Cycles of a 16 MHz AVR, measured (tests/budget.csv; tests/target/test_settings.py holds them to it).
 enum app_rate_cost {
-    COST_SENSE = 4650,          // interrupts of one sensing cycle; they send the gaze as well
-    COST_FRAME = 4200,          // readings, features, exposure and health of one channel, the loop
-    COST_MODEL = 2850,          // inference: with any model, and per vector
-    COST_VECTOR = 158,
-    COST_GAZE = 1050,           // its packet
-    COST_RAW = 4000,            // and sending it
-    COST_COUNTS = 7500,
-    COST_REQUEST = 60,          // a look at the line; a request makes a frame wait
+    COST_SENSE = 4250,          // interrupts of one sensing cycle; they send the gaze as well
+    COST_FRAME = 3950,          // readings, features, exposure and health of one channel, the loop
+    COST_MODEL = 2750,          // inference: with any model, and per vector, with the interrupts of that time
+    COST_VECTOR = 176,
+    COST_GAZE = 1030,           // its packet
+    COST_RAW = 5300,            // and sending it
+    COST_COUNTS = 7000,
+    COST_REQUEST = 100,          // a look at the line; a request makes a frame wait
 };
 
 // All of the following is in device microseconds, of 16 cycles, rounded so that nothing gets too short. A frame
