@@ -60,10 +60,10 @@ def test_every_exposure_is_what_was_taken_to_the_cycle(port_app, seed):
     for k in range(16):
         slot = rng.choice([SLOT, SLOT, 900, 1111, 1777])
         assert app.timing(period_cycles=SLOTS * slot).period_cycles == SLOTS * slot
-        asked = [rng.choice([64, 208, m, rng.randrange(208, m + 1)]) for m in most(slot)]
+        asked = [rng.choice([64, 136, m, rng.randrange(136, m + 1)]) for m in most(slot)]
         took, found = taken(app, asked)
         for a, b in zip(asked, took):
-            assert abs(a - b) <= 96 or (a, b) == (64, 208)
+            assert abs(a - b) <= 96 or (a, b) == (64, 136)
         assert all(took[a] == asked[a] for a, _ in PAIRS)
         assert len(found) > 100
         wrong = [s for s in found if s.released is None or s.cycle - s.released != took[s.channel]]

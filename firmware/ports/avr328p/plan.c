@@ -123,13 +123,18 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
         more = m;
     }
 
-    uint8_t set = 1, admux = ADMUX_GROUND;
+    // Cycles from setting the lights to the release, if the next release is one that does.
+    uint8_t set = LIGHT_LEAD_CYCLES, admux = ADMUX_GROUND;
     int16_t trigger = -slot;            // of the slot that the service is in
     int16_t service = HOLD_AT - slot;
     for (uint8_t k = 0;; k++) {
         uint8_t released = 0;
         while (left) {
-            int16_t at = release - (set ? LIGHT_LEAD_CYCLES : RELEASE_LEAD_CYCLES);
+            // A short exposure of the second: the first's is over, so its node may be held once more.
+            uint8_t lead = set;
+            if (release > 2 * slot + SAMPLE_CYCLES - SHORT_CYCLES)
+                lead = SHORT_LEAD_CYCLES;
+            int16_t at = release - (lead ? lead : RELEASE_LEAD_CYCLES);
             // A service right after a release costs no interrupt of its own; but lights go out in time, and
             // the result is read before the next.
             if (k == 0) {
@@ -140,8 +145,8 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
             } else if (k != 3 && at >= service + SPACING_CYCLES && release > trigger + SERVICE_LATEST) {
                 break;
             }
-            event((set ? EVENT_SET_RELEASE : EVENT_RELEASE) | EVENT_ALONE, at);
-            if (set) {
+            event((lead ? EVENT_SET_RELEASE : EVENT_RELEASE) | EVENT_ALONE, at);
+            if (lead) {
                 put(portc);
                 put(portd);
                 put((uint8_t)(release - at - LEAD_LESS_CYCLES));

@@ -24,7 +24,7 @@ enum port_limits {
     EXPOSURE_MIN_CYCLES = 64,
     // Of a pair's second: let go, late as it may be, before the sample capacitor comes with what the first
     // left on it.
-    EXPOSURE_SECOND_MIN_CYCLES = 208,
+    EXPOSURE_SECOND_MIN_CYCLES = 136,
     // The eye-safety cap: the first sensor of a pair is exposed at most 2 slots less this, the second 3 slots
     // less this, and lights are on from at most LIGHTS_AHEAD_CYCLES before the first release until just after
     // the second sample: 3 of the 6 slots of a phase. No command and no caller gets past plan_clip().

@@ -37,6 +37,8 @@ enum sense_cycles {
     HOLD_AT = SAMPLE_CYCLES - 40,
     RELEASE_LEAD_CYCLES = 98,       // 76 when nothing is in the way
     LIGHT_LEAD_CYCLES = 113,
+    SHORT_CYCLES = 300,             // exposures of a second below are not late for a serial byte
+    SHORT_LEAD_CYCLES = RELEASE_LEAD_CYCLES + 80,
     // From the first event's match, a service, to a release's, so that that is not late.
     HOLD_CYCLES = 166,
     SPACING_CYCLES = 200,           // the same of the others: the one that completes a cycle takes longer
@@ -51,7 +53,7 @@ enum sense_cycles {
 };
 
 enum plan_limits {
-    PLAN_BYTES = 3 * (3 * 3 + 6 + 3 + 3),
+    PLAN_BYTES = 3 * (3 * 3 + 6 + 6 + 3),
     GAP_BYTES = 8,
     GAP_WAIT_AT = 6,
     CODES = 14,                     // of the first pair's GND slots, and of twelve samples
