@@ -13,6 +13,7 @@ enum {
     ACQUIRED_A_CYCLE = 2,
     LEAST_MOST = 1024,          // a port that takes more instead has other reasons
     SOON_LOOKS = 32,            // 0.2 s
+    SETTLED_LOOKS = 4,
     WATCH_LOOKS = 5,            // 30 ms: five phases of a period of 10 ms
     SLOW_ROUNDS = 170,          // 1 s at 6 ms a round
 };
@@ -203,7 +204,7 @@ static uint8_t at_once(struct sg_expose *expose, const uint16_t lit_code[6], con
         const uint16_t lit = lit_code[i], unlit = unlit_code[i];
         // Two full without our light: so much of it came that the others will be, and all change at once.
         if (drowned >= 2 && exposure_cycles[i] == led->exposure_cycles && led->stage == SG_EXPOSE_TRACK
-            && led->age >= SOON_LOOKS) {
+            && led->age >= SETTLED_LOOKS) {
             changed |= full(led, SG_EXPOSE_SATURATED_CODE, exposure_cycles[i]);
         } else if (is_full(lit, unlit)) {
             changed |= full(led, unlit, exposure_cycles[i]);

@@ -6,7 +6,7 @@
 #include "sg_light_table.h"
 #include "sg_rom.h"
 
-enum { LATE_UNKNOWN = 255 };
+enum { LATE_UNKNOWN = 255, LATE_SLOPE_Q16 = 14800 };
 
 const uint8_t sg_light_order[2][6] SG_ROM = { { 5, 0, 1, 4, 2, 3 }, { 0, 3, 1, 4, 2, 5 } };
 
@@ -84,6 +84,12 @@ static int16_t missed_q5(struct sg_light_channel *channel, uint16_t code, uint16
     return came <= 0 ? 0 : (int16_t)(((uint32_t)came * ratio) >> 16);
 }
 
+// A little charge as a difference of codes: over the curve's slope, about 1 - 0.113 x.
+static int16_t as_code(int16_t charge_q5, uint16_t code_q5)
+{
+    return (int16_t)(charge_q5 - high(charge_q5, high((int16_t)code_q5, LATE_SLOPE_Q16)));
+}
+
 // What the mean would be if codes could be negative, down to the code of 0 V.
 static int16_t unclipped_q5(uint16_t mean_q5, int8_t zero_q5)
 {
@@ -154,14 +160,14 @@ void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint
         channel->flags |= SG_LIGHT_SATURATED;
     const uint8_t late_lit = reading->late_lit_cycles[i], late_unlit = reading->late_unlit_cycles[i];
     // A neighbour released late brought less than usual.
-    unlit_q5 = (uint16_t)(unlit_q5 + high(pass->unlit_more_q5, SHARE_Q16));
+    const int16_t lacking = high(pass->unlit_more_q5, SHARE_Q16);
+    unlit_q5 = (uint16_t)(unlit_q5 + as_code(lacking, unlit_q5));
     int16_t missed = 0, more = 0;
     if (late_lit)
         missed = missed_q5(channel, lit, pass->lit_code, late_lit);
     if (late_unlit) {
         more = missed_q5(channel, unlit, pass->unlit_code, late_unlit);
-        // From charge to code: over the curve's slope, 1 + 2 k1 x, of which `more` has the half.
-        more = (int16_t)(more - high(more, high((int16_t)unlit_q5, TWICE_K1_Q16)));
+        more = as_code(more, unlit_q5);
         unlit_q5 = (uint16_t)(unlit_q5 + more);
     }
     const int16_t meant_q5 = ambient_q5(light, channel, unlit_q5, pass);

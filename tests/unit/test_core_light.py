@@ -344,6 +344,22 @@ def test_late_releases_are_made_up_for(late):
         assert flags == 0 and np.abs(got - good).max() <= 2 * bound
 
 
+@pytest.mark.parametrize("late", [1, 8, 22])
+def test_late_releases_in_full_sun_are_made_up_for(late):
+    board = Board(120, SUN_NA, exposure=[250, 220, 220, 250, 250, 220])
+    light = Light(board)
+    settle(board, light)
+    good, _ = light.frame(board.cycle())
+    one_code = 4096 / np.log(2) / (read(collected_pc(120 + SUN_NA, 220)) - read(collected_pc(SUN_NA, 220)))
+    for which in range(6):
+        for kind in ("late_lit", "late_unlit"):
+            cycles = np.zeros(6, int)
+            cycles[which] = late
+            got, flags = light.frame(board.cycle(**{kind: cycles}))
+            assert flags == 0 and np.abs(got - good).max() <= 1.6 * one_code, (kind, which, got - good, one_code)
+            settle(board, light, 20)
+
+
 def test_a_release_too_late_to_make_up_for_is_starved_not_wild():
     board = Board(120, 60.0, exposure=[400] * 6)
     light = Light(board)
