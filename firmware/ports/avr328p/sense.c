@@ -19,7 +19,7 @@ enum {
     PAUSE_WHOLE_CYCLES = 0xC000,
     LOCKOUT_WRAPS = LOCKOUT_MS * (F_CPU / 1000) / 65536 + 1,
     HELD_LEAST = 9,                 // code: what is below is an offset of the converter, not a voltage
-    SUPPLY_EVERY_CYCLES = 1024,
+    SUPPLY_EVERY_WRAPS = 244,       // a second
     SUPPLY_CODE_LEAST = 130,        // 4.2 V at a bandgap of 1.2 V,
     SUPPLY_CODE_MOST = 235,         // 5.7 V at 1.0 V: beyond, nothing or something else is on the pin
     SUPPLY_MV_PER_CODE_Q8 = 6875,   // 1.1 V / 1024 / 0.04
@@ -67,7 +67,7 @@ static uint8_t shown_plan = NONE;           // what the reading's exposures and 
 static uint16_t mean_to_last, mean_to_end;
 static uint8_t late_shown;
 static uint16_t cycles_max;
-static uint16_t cycles;                     // taken, low half
+static uint8_t supply_wraps = 16;           // of TCNT1, when the supply was last asked for: soon at first
 static volatile uint8_t supply;             // enum supply
 enum supply { SUPPLY_RESTS, SUPPLY_WANTED, SUPPLY_ASKED };
 static uint8_t supply_of;                   // the cycle that has it makes sense_done this
@@ -377,8 +377,11 @@ SELDOM void sense_start(struct hal_timing *t, uint16_t exposure_cycles[HAL_CHANN
 
 static void look_at_supply(uint8_t done, uint16_t held_code)
 {
-    if ((++cycles & (SUPPLY_EVERY_CYCLES - 1)) == 0)
+    const uint8_t now_wraps = (uint8_t)sense_wraps;
+    if ((uint8_t)(now_wraps - supply_wraps) >= SUPPLY_EVERY_WRAPS) {
+        supply_wraps = now_wraps;
         supply = SUPPLY_WANTED;
+    }
     if (supply != SUPPLY_ASKED || done != supply_of)
         return;
     supply = SUPPLY_RESTS;
