@@ -25,7 +25,7 @@ SHIFT_PLACES = ((0, 0), (-12, -12), (12, -12), (-12, 12), (12, 12))
 def precision(board, places=None):
     """RMS-S2S and error over the grid, the eye still: dict of s2s_deg, s2s_250_deg, error_deg, ..."""
     frames, target, index = board.grid(places)
-    return judge_grid(frames, target, index)
+    return {**judge_grid(frames, target, index), "exposure_us": list(board.device.exposure().exposure_us)}
 
 
 def judge_grid(frames, target, index):
@@ -66,7 +66,6 @@ def ambient(board, name, repeats=1):
     board.control.set("ambient", name)
     came = board.frames(0.3)
     found = precision(board)
-    found["exposure_us"] = list(board.device.exposure().exposure_us)
     found["saturated_after"] = saturated_after(came)
     found["rate_hz"] = rate_of(came)
     if repeats != 1:
