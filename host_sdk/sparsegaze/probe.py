@@ -65,8 +65,7 @@ def measure(device, repeats=3, progress=None):
             if progress:
                 progress("probe", k * LEDS + emitter + 1, repeats * LEDS)
     seen = np.isfinite(found).sum(axis=0) > repeats // 2
-    with np.errstate(all="ignore"):
-        out = np.where(seen, np.nanmedian(np.where(np.isfinite(found), found, np.nan), axis=0), np.nan)
+    out = np.where(seen, np.nanmedian(np.where(seen, found, 0.0), axis=0), np.nan)
     return np.where(KNOWN, out, np.nan)
 
 

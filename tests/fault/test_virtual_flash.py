@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flashing a virtual Nano through the stock bootloaders: by us, by avrdude, cut off, without auto-reset."""
 
+import configparser
 import subprocess
 import threading
 
@@ -47,6 +48,14 @@ def test_both_stock_bootloaders_are_found_by_trying_and_flashed(virtual_nano, fi
     with Device(nano.port) as device:
         assert device.hello.wire_version == lib.SG_WIRE_VERSION
         assert device.status().frames > 0
+
+
+def small_build():
+    """Flags of the shipped build, without which the firmware does not fit."""
+    config = configparser.ConfigParser()
+    config.read(REPO / "platformio.ini")
+    flags = [flag for flag in config["env:nano"]["build_flags"].split("\n") if flag and flag[:2] != "-I"]
+    return [*flags, "-flto", "-ffunction-sections", "-fdata-sections", "-Wl,--gc-sections"]
 
 
 def test_stock_avrdude_flashes_the_same_hex_and_reads_it_back(virtual_nano, firmware_hex, tmp_path):
@@ -158,7 +167,7 @@ def test_firmware_of_another_protocol_version_is_named_and_replaced(virtual_nano
     (core / "sg_gp_loop.c").unlink()            # its twin in assembler takes its place
     sources = [path for folder in (core, FIRMWARE / "app", FIRMWARE / "ports" / "avr328p")
                for path in sorted(folder.iterdir()) if path.suffix in (".c", ".S")]
-    flags = [f"-I{core}", f"-I{FIRMWARE / 'app'}", f"-I{FIRMWARE / 'ports' / 'avr328p'}"]
+    flags = [f"-I{core}", f"-I{FIRMWARE / 'app'}", f"-I{FIRMWARE / 'ports' / 'avr328p'}", *small_build()]
     nano = virtual_nano(map=False, unpaced=True)
     flash_hex(nano.port, avr_build(tmp_path, sources, flags))
     with pytest.raises(ProtocolError) as caught:
