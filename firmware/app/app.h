@@ -42,7 +42,8 @@ struct app_state {
     uint8_t pause;                      // between frames
     uint8_t infer_fits;                 // beside that of every frame, one for a request
     uint8_t roomy;                      // beside a frame's work, any request
-    uint8_t fresh;                      // a cycle's work has just been done
+    uint8_t fresh;                      // a cycle's work has just been done, and nothing else since
+    uint16_t period_us;                 // of a cycle
 };
 extern struct app_state app;
 enum { APP_NO_PROBE = 255 };

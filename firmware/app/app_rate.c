@@ -14,7 +14,7 @@ enum app_rate_cost {
     COST_GAZE = 1030,           // its packet
     COST_RAW = 5300,            // and sending it
     COST_COUNTS = 7000,
-    COST_REQUEST = 100,          // a look at the line; a request makes a frame wait
+    COST_REQUEST = 150,          // a look at the line; a request makes a frame wait
 };
 
 // All of the following is in device microseconds, of 16 cycles, rounded so that nothing gets too short. A frame
@@ -130,6 +130,7 @@ SELDOM void app_rate_start(struct hal_timing *timing)
     timing->sleep = app_live.power == SG_POWER_LOW;
     // What is left of the time until the next frame's first cycle is complete.
     const uint16_t spare = frame - (uint16_t)(period << shift) + period - work_us();
+    app.period_us = period;
     app.infer_fits = !app.sensed || spare >= infer_us();
     app.roomy = !app.sensed || spare >= ROOMY_US;
 }

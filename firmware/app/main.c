@@ -11,6 +11,12 @@ enum {
     // A blink leaves the calibrated range before the lids are where they were: this long after the last frame
     // out of range a gaze may look right and be wrong.
     RECOVERY_US = 31000,
+    // A frame's work may end so much later than one period after its last sample for a request still to fit before
+    // readings are lost: the costliest takes 500 us.
+    BEHIND_US = 200,
+    // What comes after the gaze takes about so much longer than the readings were on their way.
+    AFTER_GAZE_US = 40,
+    CATCH_UP_CYCLES = 8,
 };
 
 struct app_state app;
@@ -27,6 +33,9 @@ static uint32_t first_us;               // mean sample time of its first cycle
 static uint16_t frame_seq;
 static uint8_t left;                    // cycles still to come
 static uint8_t under_way;
+static uint16_t last_us;                // of the last sample
+static uint8_t behind;                  // the last gaze was late
+static uint8_t skipped;                 // cycles without a look at exposures and health
 
 static uint16_t previous_exposure[HAL_CHANNELS];
 static uint32_t out_us;                 // when the last frame out of range was sensed
@@ -72,9 +81,16 @@ NOT_KEPT static uint8_t long_work(void)
     return 1;
 }
 
+// Something that takes a part of a frame's time is begun right after a frame's work, and only if that was not much
+// behind: what made it late before has been caught up with by then, and no frame is ever lost.
+static uint8_t time_for_more(void)
+{
+    return app.roomy || (app.fresh && (uint16_t)(hal_now_us16() - last_us) < app.period_us + BEHIND_US);
+}
+
 uint8_t app_listens(void)
 {
-    return !asked.waiting && (app.roomy || app.fresh);
+    return !asked.waiting && time_for_more();
 }
 
 void app_on_byte(uint8_t byte, uint32_t zero_us)
@@ -169,6 +185,7 @@ static void finish_frame(const struct hal_cycle *cycle)
     if (app.stream & SG_STREAM_GAZE) {
         out->gaze.t_us = t_us;
         out->gaze.infer_us = hal_now_us16() - (uint16_t)t_us - span_us;
+        behind = out->gaze.infer_us > app.period_us - AFTER_GAZE_US;
         send_stream(SG_MSG_GAZE, &out->gaze, sizeof out->gaze);
     }
     if (app.stream & SG_STREAM_RAW) {
@@ -215,9 +232,16 @@ void app_on_cycle(const struct hal_cycle *cycle)
             finish_frame(cycle);
         else if (last && app.stream)
             app_count(&app.status.tx_dropped);
-        app_sense_cycle(cycle);
+        // One that is behind catches up at the cost of its looks at exposures and health.
+        if (behind && skipped < CATCH_UP_CYCLES) {
+            skipped++;
+        } else {
+            skipped = 0;
+            app_sense_cycle(cycle);
+        }
     }
     app_live_cycle(cycle->t_us);
+    last_us = (uint16_t)cycle->t_us + cycle->span_us;
     app.fresh = 1;
 }
 
@@ -251,10 +275,11 @@ int main(void)
 {
     start();
     while (hal_poll()) {
-        app.fresh = 0;
         if (app.infer_fits)
             long_work();
-        app_models_step();
+        if (time_for_more())
+            app_models_step();
+        app.fresh = 0;
         app_live_step();
     }
     return 0;
