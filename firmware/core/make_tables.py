@@ -5,6 +5,7 @@
     python3 firmware/core/make_tables.py            write them beside this script
     python3 firmware/core/make_tables.py --check    exit 1 if a committed file differs
 """
+import cmath
 import math
 import os
 import sys
@@ -22,7 +23,7 @@ UNIT_A = 62.5e-12         # feature 0
 FEATURE_PER_OCTAVE = 4096
 CODE_UNIT = 32            # charges and codes are counted in 1/32 of a code
 
-# Ambient light: exact at this frequency, so nearly at 100 and 120 Hz. An unlit sample comes 3 of 18 slots after
+# Ambient light: weights near those exact at this frequency, least wrong at 100 and 120 Hz. An unlit sample comes 3 of 18 slots after
 # the lit one.
 FLICKER_HZ = 110.0
 LIT_BEFORE_UNLIT = 3.0 / 18.0
@@ -124,10 +125,25 @@ def flicker_weights(period_cycles):
     return before, earlier
 
 
+def flicker_left(before_q8, earlier_q8, period_cycles, hz):
+    """What these weights, b and -c in 1/256, leave of flicker, of its amplitude."""
+    turn = cmath.exp(-2j * math.pi * hz * period_cycles / TIMER_HZ)
+    back = cmath.exp(-2j * math.pi * hz * period_cycles / TIMER_HZ * LIT_BEFORE_UNLIT)
+    before, earlier = before_q8 / 256, -earlier_q8 / 256
+    return abs(1 - before - earlier + before * turn + earlier * turn * turn - back)
+
+
+def flicker_weights_q8(period_cycles):
+    """(b, -c) in 1/256 beside those exact at 110 Hz that leave least of 100 and 120 Hz, the worse of both."""
+    before, earlier = flicker_weights(period_cycles)
+    near = [(rounded(256 * before) + i, rounded(-256 * earlier) + j) for i in range(-2, 3) for j in range(-2, 3)]
+    return min(near, key=lambda pair: max(flicker_left(*pair, period_cycles, hz) for hz in (100.0, 120.0)))
+
+
 def light_table():
     """Text of sg_light_table.h."""
     unit_a = capacitance_at_rest_pf() * 1e-12 * REFERENCE_V / 1024 / CODE_UNIT * TIMER_HZ
-    weights = [flicker_weights(PERIOD_FROM + PERIOD_STEP * i) for i in range(PERIOD_NODES)]
+    weights = [flicker_weights_q8(PERIOD_FROM + PERIOD_STEP * i) for i in range(PERIOD_NODES)]
     k1, k2 = curvature()
     return (LICENSE + MADE_BY + "#ifndef SG_LIGHT_TABLE_H\n#define SG_LIGHT_TABLE_H\n\n"
             f"// Feature of 1/{CODE_UNIT} code collected in 1 cycle.\n"
@@ -144,8 +160,8 @@ def light_table():
             "// and -c of sg_light.h, Q0.8.\n"
             f"#define PERIOD_FROM {PERIOD_FROM}U\n#define PERIOD_BITS {PERIOD_STEP.bit_length() - 1}\n"
             f"#define PERIOD_NODES {PERIOD_NODES}\n"
-            f"#define BEFORE_Q8 {{ {', '.join(str(rounded(256 * b)) for b, _ in weights)} }}\n"
-            f"#define EARLIER_MINUS_Q8 {{ {', '.join(str(rounded(-256 * c)) for _, c in weights)} }}\n\n#endif\n")
+            f"#define BEFORE_Q8 {{ {', '.join(str(b) for b, _ in weights)} }}\n"
+            f"#define EARLIER_MINUS_Q8 {{ {', '.join(str(c) for _, c in weights)} }}\n\n#endif\n")
 
 
 def rectified(level, noise):

@@ -21,7 +21,7 @@
 #define PERIOD_FROM 15984U
 #define PERIOD_BITS 11
 #define PERIOD_NODES 9
-#define BEFORE_Q8 { 76, 75, 75, 74, 73, 72, 71, 70, 69 }
-#define EARLIER_MINUS_Q8 { 19, 20, 20, 21, 22, 23, 24, 25, 26 }
+#define BEFORE_Q8 { 77, 74, 74, 74, 73, 71, 70, 70, 67 }
+#define EARLIER_MINUS_Q8 { 20, 19, 20, 21, 22, 22, 23, 25, 25 }
 
 #endif
