@@ -59,7 +59,8 @@ def bars(report):
         most("step.saturated_frames", report["step"]["saturated_frames"], STEP_SATURATED)
         most("step.settle_frames", report["step"]["settle_frames"], STEP_SETTLE)
         most("exposure_shift_deg over RMS-S2S", report["exposure_shift_over_s2s"], 1.0)
-        most("flicker_ratio, over steady light of that size", report["flicker_ratio"], FLICKER)
+        most("flicker_ratio_250, over steady light, set to 4 cycles a frame", report["flicker_ratio_250"], FLICKER)
+        most("flicker_ratio, over steady light, default setting", report["flicker_ratio"], FLICKER, "aim")
     if "irradiance_w_m2" in report:
         for case, value in report["irradiance_w_m2"].items():
             most(f"irradiance_w_m2, {case}", value, IRRADIANCE_W_M2)

@@ -59,17 +59,15 @@ def judge_grid(frames, target, index):
 
 def ambient(board, name, repeats=1):
     """precision() in an ambient light of physics.toml, and how many frames after its coming were saturated."""
+    board.device.settings(repeats=repeats)
     rest(board)
-    if repeats != 1:
-        board.device.settings(repeats=repeats)
-        board.frames(0.2)
     board.control.set("ambient", name)
     came = board.frames(0.3)
     found = precision(board)
     found["saturated_after"] = saturated_after(came)
     found["rate_hz"] = rate_of(came)
-    if repeats != 1:
-        board.device.settings(repeats=1)
+    rest(board)
+    board.device.settings(repeats=1)
     return found
 
 
@@ -90,15 +88,17 @@ def rate_of(frames):
     return float((len(frames) - 1) / (frames["t_us"][-1] - frames["t_us"][0]) * 1e6)
 
 
-def flicker(board):
+def flicker(board, repeats=1):
     """Errors in steady light of the signal's size, and in light that flickers at 100 and 120 Hz."""
     found = {}
+    board.device.settings(repeats=repeats)
     for name, depth, hz in (("steady", 0.0, 100), ("100", FLICKER, 100), ("120", FLICKER, 120)):
         rest(board)
         board.control.ambient(SIGNAL_NA, depth, hz)
         board.frames(0.3)
         found[name] = precision(board)
     rest(board)
+    board.device.settings(repeats=1)
     return found
 
 

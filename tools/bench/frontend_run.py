@@ -78,6 +78,7 @@ def _nominal(board, row, quick, rng, folder):
     row["ambient_250"].update({name: measures.ambient(board, name, SLOW_REPEATS) for name in names})
     board.control.set("ambient", "dark")
     row["flicker"] = measures.flicker(board)
+    row["flicker_250"] = measures.flicker(board, SLOW_REPEATS)
     row["shift"] = measures.exposure_shift(board)
     row["step"] = measures.steps(board, QUICK_STEPS if quick else STEPS, rng)
     row["stream"] = measures.stream(board, QUICK_STREAM_S if quick else STREAM_S, rng, folder / "frames.csv")
@@ -156,13 +157,14 @@ def worst(rows):
         key: most(lambda row, key=key: _larger(row["step"]["up"][key], row["step"]["down"][key]))
         for key in ("saturated_frames", "settle_frames")
     }
-    out["flicker_ratio"] = most(
-        lambda row: max(row["flicker"][hz]["error_deg"] for hz in ("100", "120")) / row["flicker"]["steady"]["error_deg"]
-    )
-    out["flicker_ratio_dark"] = most(
-        lambda row: max(row["flicker"][hz]["error_deg"] for hz in ("100", "120")) / row["ambient"]["dark"]["error_deg"]
-    )
+    for key, table in (("flicker_ratio", "flicker"), ("flicker_ratio_250", "flicker_250")):
+        out[key] = most(lambda row, t=table: flicker_ratio(row[t]))
     return out
+
+
+def flicker_ratio(table):
+    """Worse of both frequencies over steady light of the same mean."""
+    return max(table[hz]["error_deg"] for hz in ("100", "120")) / table["steady"]["error_deg"]
 
 
 def _larger(first, second):
