@@ -32,7 +32,7 @@
 #define READING_EXPOSURE 24
 #define READING_LATE_LIT 36
 #define READING_LATE_UNLIT 42
-#define PASS_BROUGHT 0
+#define PASS_MISSED 0
 #define PASS_LIT 2
 #define PASS_UNLIT 4
 #define PASS_DEPARTURE 6
@@ -141,18 +141,20 @@ sg_light_add:
     ldd r25, Z + READING_HELD + 1
     push r25                    ; lit_code
     push r24
-    push zero                   ; brought_q5
-    push zero
     clt                         ; T: this channel is not ordinary
-    movw broughtl, r24
+    movw r22, r24
     or r24, r25
     breq 4f
     set
     .rept 5
-    lsl broughtl
-    rol broughth
+    lsl r22
+    rol r23
     .endr
-4:  ldi r24, lo8(sg_light_order)
+4:  push r23                    ; missed_q5: what was held
+    push r22
+    clr broughtl
+    clr broughth
+      ldi r24, lo8(sg_light_order)
     ldi r25, hi8(sg_light_order)
     sbrc r21, 0
     adiw r24, 6
@@ -163,15 +165,14 @@ each:
     movw r30, orderl
     lpm r26, Z+
     movw orderl, r30
-    brtc 1f
-    rjmp other
-1:
-ordinary:
     ldi r24, CHANNEL_BYTES
     mul r26, r24
     movw r28, r0
     add r28, lightl
     adc r29, lighth
+    brtc ordinary
+    rjmp other
+ordinary:
     movw r30, readingl
     add r30, r26
     adc r31, zero
@@ -248,6 +249,8 @@ full:                           ; and nobody knows what the next of this pair ge
     in r31, 0x3E
     std Z + 1 + PASS_MORE, zero
     std Z + 2 + PASS_MORE, zero
+    std Z + 1 + PASS_MISSED, zero
+    std Z + 2 + PASS_MISSED, zero
     set
     rjmp known
 
@@ -434,7 +437,14 @@ meant:                          ; r19:r18 lit, r23:r22 unlit as meant
     upper_signed r31, r30, r23, r22, r21, r20, r26
     sub r24, r30
     sbc r25, r31
-7:  movw broughtl, r18          ; for the next, with what the rail did
+7:  brtc 1f
+    in r30, 0x3D                ; what a late release missed, or the capacitor held
+    in r31, 0x3E
+    ldd r20, Z + 1 + PASS_MISSED
+    ldd r21, Z + 2 + PASS_MISSED
+    add r24, r20
+    adc r25, r21
+1:  movw broughtl, r18          ; for the next, with what the rail did
     add broughtl, r27
     adc broughth, zero
     clr r20                     ; the signal, 32 bits
@@ -538,14 +548,15 @@ other:                          ; r26: the channel, untouched so far
     in r31, 0x3E
     adiw r30, 1
     movw r18, r30
-    std Z + PASS_BROUGHT, broughtl
-    std Z + PASS_BROUGHT + 1, broughth
     std Z + PASS_DEPARTURE, departl
     std Z + PASS_DEPARTURE + 1, departh
     tst turn
     breq 3f                     ; the pass holds what came before the first
     clr r22
     clr r23
+    movw r30, r18
+    std Z + PASS_MISSED, r22
+    std Z + PASS_MISSED + 1, r22
     brts 1f                     ; the first of this pair went the same way: its word stands
     std Z + PASS_MORE, r22
     std Z + PASS_MORE + 1, r22
@@ -568,19 +579,26 @@ other:                          ; r26: the channel, untouched so far
     std Z + PASS_LIT + 1, r23
     std Z + PASS_UNLIT, r24
     std Z + PASS_UNLIT + 1, r25
-3:  movw r24, lightl
+3:  push r20
+    movw r24, lightl
     movw r22, readingl
     clr r1
-    call sg_light_one
+    call sg_light_meant
+    pop r26
     in r30, 0x3D
     in r31, 0x3E
-    adiw r30, 1
-    ldd broughtl, Z + PASS_BROUGHT
-    ldd broughth, Z + PASS_BROUGHT + 1
-    ldd departl, Z + PASS_DEPARTURE
-    ldd departh, Z + PASS_DEPARTURE + 1
+    ldd departl, Z + 1 + PASS_DEPARTURE
+    ldd departh, Z + 2 + PASS_DEPARTURE
+    movw r22, r24
+    movw r30, readingl
+    lsl r26
+    add r30, r26
+    adc r31, zero
+    ldd r18, Z + READING_LIT
+    ldd r19, Z + READING_LIT + 1
+    to_q5 r19, r18
     set                         ; the second of the pair asks what the first held
-    rjmp next
+    rjmp meant
     .size sg_light_add, . - sg_light_add
 
 ; ---- uint8_t sg_light_features(struct sg_light *light r25:r24, uint16_t *feature r23:r22)

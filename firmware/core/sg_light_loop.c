@@ -6,7 +6,7 @@
 #include "sg_light_table.h"
 #include "sg_rom.h"
 
-enum { LATE_UNKNOWN = 255, LATE_SLOPE_Q16 = 14800 };
+enum { LATE_UNKNOWN = 255, LATE_SLOPE_Q16 = 14800, CURVED_Q16 = 7314 };
 
 const uint8_t sg_light_order[2][6] SG_ROM = { { 5, 0, 1, 4, 2, 3 }, { 0, 3, 1, 4, 2, 5 } };
 
@@ -25,24 +25,6 @@ static int16_t by_q8(int16_t x, uint8_t weight_q8)
 static uint16_t size_of(int16_t x)
 {
     return (uint16_t)(x < 0 ? -x : x);
-}
-
-// Charge between an unlit and a lit code, less their difference D. With X the mean of both over 1024 and d half
-// their difference:  D (2 k1 X + 3 k2 (X^2 + d^2 / 3) + curve X / 512).
-//   slope_q16   2 k1 + curve / 512
-// 65536 X is the sum of both codes. In the small term its upper byte does, which is half a step of 1/256 too small
-// on average: SG_LIGHT_SLOPE_Q16 makes that up. d^2 is the
-// upper byte of (256 d)^2 over 256.
-// Overflow   the bracket is within -0.25 .. 0.44 in Q0.16.
-static int16_t bend_q5(uint16_t lit_q5, uint16_t unlit_q5, int16_t slope_q16)
-{
-    const int16_t difference = (int16_t)(lit_q5 - unlit_q5);
-    const uint16_t sum = (uint16_t)(lit_q5 + unlit_q5);
-    const uint8_t x = (uint8_t)(sum >> 8);
-    const int8_t d = (int8_t)(difference >> 8);
-    const int16_t slope = (int16_t)(slope_q16 + (int16_t)(x * SG_LIGHT_CUBIC));
-    const int16_t bracket = (int16_t)((int16_t)(((int32_t)slope * sum) >> 16) + (int16_t)(((uint16_t)(d * d) >> 8) << SG_LIGHT_SQUARE_SHIFT));
-    return high(difference, bracket);
 }
 
 // What is known of a channel's ambient light is this code and no more.
@@ -78,7 +60,9 @@ static int16_t missed_q5(struct sg_light_channel *channel, uint16_t code, uint16
     }
     const uint16_t ratio = ratio_q16(late_cycles, (uint16_t)(channel->exposure_cycles - late_cycles));
     const uint16_t code_q5 = sg_light_q5(code);
-    const int32_t came = (int32_t)code_q5 + bend_q5(code_q5, 0, channel->slope_q16)
+    // of the curve, 0.056 x is enough here
+    const int16_t bracket = high((int16_t)code_q5, CURVED_Q16);
+    const int32_t came = (int32_t)code_q5 + high((int16_t)code_q5, bracket)
                        - high((int16_t)sg_light_q5(before), SHARE_Q16);
     // less than 2^16; half of it at most is missed. A negative one is noise.
     return came <= 0 ? 0 : (int16_t)(((uint32_t)came * ratio) >> 16);
@@ -144,11 +128,10 @@ void sg_light_begin(struct sg_light_channel *channel, uint16_t exposure_cycles, 
     settle(channel, sg_light_q5(unlit_code));
 }
 
-void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint8_t i, struct sg_light_pass *pass)
+int16_t sg_light_meant(struct sg_light *light, const struct sg_reading *reading, uint8_t i, struct sg_light_pass *pass)
 {
     struct sg_light_channel *channel = &light->channel[i];
     const uint16_t lit = reading->lit_code[i], unlit = reading->unlit_code[i];
-    const uint16_t lit_q5 = sg_light_q5(lit);
     uint16_t unlit_q5 = sg_light_q5(unlit);
     if (channel->exposure_cycles != reading->exposure_cycles[i])
         sg_light_begin(channel, reading->exposure_cycles[i], unlit);
@@ -162,31 +145,19 @@ void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint
     // A neighbour released late brought less than usual.
     const int16_t lacking = high(pass->unlit_more_q5, SHARE_Q16);
     unlit_q5 = (uint16_t)(unlit_q5 + as_code(lacking, unlit_q5));
-    int16_t missed = 0, more = 0;
+    int16_t missed = (int16_t)-high(pass->missed_q5, SHARE_Q16), more = 0;
     if (late_lit)
-        missed = missed_q5(channel, lit, pass->lit_code, late_lit);
+        missed = (int16_t)(missed + missed_q5(channel, lit, pass->lit_code, late_lit));
     if (late_unlit) {
         more = missed_q5(channel, unlit, pass->unlit_code, late_unlit);
         more = as_code(more, unlit_q5);
         unlit_q5 = (uint16_t)(unlit_q5 + more);
     }
-    const int16_t meant_q5 = ambient_q5(light, channel, unlit_q5, pass);
-    // Lit emitters lift the rail by 24 mV (0.3 ohm, 4 emitters of 20 mA), and a junction biased more holds less: 0.21 to
-    // 0.24 % of the code, here 2^-9 + 2^-12. Emitters of photodiodes do not flow through it.
-    const uint8_t lit_high = (uint8_t)(lit_q5 >> 8);
-    const uint16_t rail = light->wiring ? 0 : (uint16_t)((lit_high >> 1) + (lit_high >> 4));
-    const int16_t difference = (int16_t)(lit_q5 - rail - (uint16_t)meant_q5);
-    const int16_t bend = bend_q5((uint16_t)(lit_q5 - rail), (uint16_t)meant_q5, channel->slope_q16);
-    const int16_t brought = high(pass->brought_q5, SHARE_Q16);
-    if (channel->cycles != UINT8_MAX) {
-        const int32_t signal = (int32_t)difference + (int16_t)(bend + missed - brought);
-        channel->sum_q5 = channel->cycles == 0 ? signal : channel->sum_q5 + signal;
-        channel->cycles++;
-    }
-    pass->brought_q5 = (int16_t)(difference + (int16_t)rail);
+    pass->missed_q5 = missed;
     pass->unlit_more_q5 = more;
     pass->lit_code = lit;
     pass->unlit_code = unlit;
+    return ambient_q5(light, channel, unlit_q5, pass);
 }
 
 uint16_t sg_light_log2_q12(uint16_t x)
@@ -233,17 +204,53 @@ void sg_light_prepare(struct sg_light *light, const struct sg_reading *reading)
 }
 
 #ifndef SG_LIGHT_ASSEMBLY
+// Charge between an unlit and a lit code, less their difference D. With X the mean of both over 1024 and d half
+// their difference:  D (2 k1 X + 3 k2 (X^2 + d^2 / 3) + curve X / 512).
+//   slope_q16   2 k1 + curve / 512
+// 65536 X is the sum of both codes. In the small term its upper byte does, which is half a step of 1/256 too small
+// on average: SG_LIGHT_SLOPE_Q16 makes that up. d^2 is the
+// upper byte of (256 d)^2 over 256.
+// Overflow   the bracket is within -0.25 .. 0.44 in Q0.16.
+static int16_t bend_q5(uint16_t lit_q5, uint16_t unlit_q5, int16_t slope_q16)
+{
+    const int16_t difference = (int16_t)(lit_q5 - unlit_q5);
+    const uint16_t sum = (uint16_t)(lit_q5 + unlit_q5);
+    const uint8_t x = (uint8_t)(sum >> 8);
+    const int8_t d = (int8_t)(difference >> 8);
+    const int16_t slope = (int16_t)(slope_q16 + (int16_t)(x * SG_LIGHT_CUBIC));
+    const int16_t bracket = (int16_t)((int16_t)(((int32_t)slope * sum) >> 16) + (int16_t)(((uint16_t)(d * d) >> 8) << SG_LIGHT_SQUARE_SHIFT));
+    return high(difference, bracket);
+}
+
 void sg_light_add(struct sg_light *light, const struct sg_reading *reading)
 {
-    struct sg_light_pass pass = { .brought_q5 = (int16_t)sg_light_q5(reading->held_code),
+    struct sg_light_pass pass = { .missed_q5 = (int16_t)sg_light_q5(reading->held_code),
                                   .lit_code = reading->held_code };
     if (light->state & (SG_LIGHT_GAP | SG_LIGHT_BEGINS))
         sg_light_prepare(light, reading);
     const uint8_t *order = sg_light_order[light->wiring];
+    int16_t brought_q5 = 0;
     for (uint8_t k = 0; k < SG_LIGHT_CHANNELS; k++) {
-        sg_light_one(light, reading, sg_rom_byte(order + k, SG_ROM_FLASH), &pass);
+        const uint8_t i = sg_rom_byte(order + k, SG_ROM_FLASH);
+        struct sg_light_channel *channel = &light->channel[i];
+        const uint16_t meant_q5 = (uint16_t)sg_light_meant(light, reading, i, &pass);
+        // Lit emitters lift the rail by 24 mV (0.3 ohm, 4 emitters of 20 mA), and a junction biased more holds less:
+        // 0.21 to 0.24 % of the code, here 2^-9 + 2^-12. Emitters of photodiodes do not flow through it.
+        const uint16_t lit_q5 = sg_light_q5(reading->lit_code[i]);
+        const uint8_t lit_high = (uint8_t)(lit_q5 >> 8);
+        const uint16_t rail = light->wiring ? 0 : (uint16_t)((lit_high >> 1) + (lit_high >> 4));
+        const int16_t difference = (int16_t)(lit_q5 - rail - meant_q5);
+        const int16_t bend = bend_q5((uint16_t)(lit_q5 - rail), meant_q5, channel->slope_q16);
+        const int16_t brought = high(brought_q5, SHARE_Q16);
+        if (channel->cycles != UINT8_MAX) {
+            const int32_t signal = (int32_t)difference + (int16_t)(bend + pass.missed_q5 - brought);
+            channel->sum_q5 = channel->cycles == 0 ? signal : channel->sum_q5 + signal;
+            channel->cycles++;
+        }
+        pass.missed_q5 = 0;
+        brought_q5 = (int16_t)(difference + (int16_t)rail);
         if (k & 1U) {
-            pass.brought_q5 = pass.unlit_more_q5 = 0;
+            brought_q5 = pass.unlit_more_q5 = 0;
             pass.lit_code = pass.unlit_code = 0;
         }
     }

@@ -27,7 +27,7 @@ enum {
 
 // What passes from channel to channel within a cycle.
 struct sg_light_pass {
-    int16_t brought_q5;         // lit less unlit code (as meant) sampled right before, 0 after ground
+    int16_t missed_q5;          // in: what the sample capacitor held from before the cycle; out: charge to add
     uint16_t lit_code;          // as sampled right before, 0 after ground
     uint16_t unlit_code;
     int16_t departure;          // sum of the sixteenths of unlit departures from their means, 1/32 code
@@ -61,8 +61,8 @@ uint16_t sg_light_log2_q12(uint16_t x);
 // Begin with another exposure: what the channel has of this frame is dropped.
 void sg_light_begin(struct sg_light_channel *channel, uint16_t exposure_cycles, uint16_t unlit_code);
 
-// Add one channel's codes.
-void sg_light_one(struct sg_light *light, const struct sg_reading *reading, uint8_t i, struct sg_light_pass *pass);
+// One channel's codes, up to the unlit code meant at the lit moment, which is returned, 1/32 code.
+int16_t sg_light_meant(struct sg_light *light, const struct sg_reading *reading, uint8_t i, struct sg_light_pass *pass);
 
 // Feature of the cycles added to a channel, at least one; sets STARVED. The cycles stay.
 uint16_t sg_light_feature(struct sg_light_channel *channel);
