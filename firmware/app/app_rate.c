@@ -76,12 +76,10 @@ SELDOM static uint16_t work_us(void)
     return cycles / CYCLES_PER_US + 1 + infer_us();
 }
 
-SELDOM static uint8_t repeats_shift(void)
+// n * by; at most 16 * 1998 and no frame's time more.
+static uint16_t times(uint16_t n, uint8_t by)
 {
-    uint8_t shift = 0;
-    while (app_live.repeats >> 1 >> shift)
-        shift++;
-    return shift;
+    return n * by;
 }
 
 // Frame after frame at least this far apart; *period_us is then one sensing cycle.
@@ -94,7 +92,7 @@ SELDOM static uint16_t shortest(uint16_t *period_us)
     if (app_live.power == SG_POWER_NORMAL)
         period = last < PERIOD_MOST_US ? last : PERIOD_MOST_US;
     *period_us = period;
-    const uint16_t frame = (uint16_t)(period << repeats_shift()) - period + last;
+    const uint16_t frame = times(period, app_live.repeats - 1) + last;
     // The line needs its time as well, and answers an eighth of it.
     const uint16_t line = (uint16_t)(stream_bytes() * BYTE_US) << (app.slow_line ? 1 : 0);
     return frame < line + (line >> 3) ? line + (line >> 3) : frame;
@@ -103,33 +101,34 @@ SELDOM static uint16_t shortest(uint16_t *period_us)
 // The timing wanted.
 SELDOM void app_rate_start(struct hal_timing *timing)
 {
-    const uint8_t shift = repeats_shift();
     uint16_t period, frame = shortest(&period);
+    uint8_t repeats = app_live.repeats;
     if (app_live.rate_hz) {
         const uint16_t wanted = million_over(app_live.rate_hz);
         if (frame < wanted)
             frame = wanted;
     }
-    // Longer exposures instead of darkness.
+    // Cycles without a gap follow ambient light that flickers: as many as there is time for, then longer ones.
     if (app_live.power == SG_POWER_NORMAL) {
-        period = frame >> shift;
-        if (period > PERIOD_MOST_US)
-            period = PERIOD_MOST_US;
+        while (repeats < SG_LIGHT_REPEATS_MAX && times(period, repeats + 1) <= frame)
+            repeats++;
+        while (period < PERIOD_MOST_US && times(period + 1, repeats) <= frame)
+            period++;
     }
-    const uint16_t dark = frame - (uint16_t)(period << shift);
-    app.pause = dark > PAUSE_US;
+    const uint16_t dark = frame - times(period, repeats);
+    app.pause = dark > (uint16_t)(PAUSE_US + repeats);
     if (!app.pause)
         frame -= dark;
     memset(timing, 0, sizeof *timing);
     timing->period_cycles = period * CYCLES_PER_US;
     timing->frame_cycles = (uint32_t)frame * CYCLES_PER_US;
-    timing->repeats = app_live.repeats;
+    timing->repeats = repeats;
     timing->wiring = app_live.wiring;
     timing->lights = app_live.lights;
     timing->probe = app.probe;
     timing->sleep = app_live.power == SG_POWER_LOW;
     // What is left of the time until the next frame's first cycle is complete.
-    const uint16_t spare = frame - (uint16_t)(period << shift) + period - work_us();
+    const uint16_t spare = frame - times(period, repeats) + period - work_us();
     app.period_us = period;
     app.infer_fits = !app.sensed || spare >= infer_us();
     app.roomy = !app.sensed || spare >= ROOMY_US;
@@ -146,7 +145,7 @@ uint16_t app_frame_us(void)
 {
     const struct hal_timing *timing = app_timing();
     if (!timing->frame_cycles)
-        return (timing->period_cycles / CYCLES_PER_US) << repeats_shift();
+        return times(timing->period_cycles / CYCLES_PER_US, timing->repeats);
     return (uint16_t)(timing->frame_cycles / CYCLES_PER_US);
 }
 

@@ -8,12 +8,15 @@
 
 enum {
     EMITTERS_PHOTODIODES = 3,
+    UNLIKE_LOOKS = 4,
     HEALTH_TURNS = 8,           // cycles from one look at the health of a channel to the next channel's; 2^n
     // Cycles of a probe, counted down: until the emitter is alone, its readings, until all is as before.
     PROBE_BEFORE = 4,
     PROBE_SUM = SG_LIGHT_REPEATS_MAX,
     PROBE_AFTER = 4,
 };
+
+static uint8_t unlike;                  // looks in a row at exposures that are not those asked for
 
 // The channel sampled right before each, per wiring (firmware/core/sg_light.h); 255: none.
 static const uint8_t before[2][HAL_CHANNELS] SG_ROM = {
@@ -152,6 +155,14 @@ static uint8_t first(uint8_t i)
     return sg_rom_byte(&before[timing.wiring][i], SG_ROM_FLASH);
 }
 
+SELDOM static uint8_t exposures_are(const uint16_t cycles[HAL_CHANNELS])
+{
+    uint8_t same = 1;
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+        same &= app.expose.led[i].exposure_cycles == cycles[i];
+    return same;
+}
+
 static void look_at(const struct sg_reading *reading)
 {
     struct sg_health_sight sight;
@@ -172,8 +183,15 @@ void app_sense_cycle(const struct hal_cycle *cycle)
 {
     const struct sg_reading *reading = &cycle->reading;
     const uint8_t health = (++turn & (HEALTH_TURNS - 1)) == 0;
-    if (health)
+    if (health) {
         look_at_alarms();
+        // What the port makes is what counts, should it ever be something else than it said.
+        unlike = exposures_are(reading->exposure_cycles) ? 0 : unlike + 1;
+        if (unlike == UNLIKE_LOOKS) {
+            sg_expose_taken(&app.expose, reading->exposure_cycles);
+            unlike = 0;
+        }
+    }
     // In the dark there is nothing to learn.
     if (alarms & (SG_ALARM_LOCKOUT | SG_ALARM_LIGHTS_OFF))
         return;

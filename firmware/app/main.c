@@ -175,8 +175,9 @@ static void finish_frame(const struct hal_cycle *cycle)
     HAL_BEGIN(HAL_SECTION_INFER);
     sg_track_infer(model, app.feature, flags, recentre, &out->gaze);
     HAL_END(HAL_SECTION_INFER);
-    // Where an exposure still has to follow the light, features say nothing about the lids.
-    if ((out->gaze.flags & SG_FLAG_OUT_OF_RANGE) && !(flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED))) {
+    // Where an exposure follows the light, features say nothing about the lids.
+    if ((out->gaze.flags & SG_FLAG_OUT_OF_RANGE)
+        && !(flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_EXPOSURE))) {
         out_us = t_us;
         recovering = 1;
     }
@@ -204,7 +205,7 @@ static void take(const struct hal_cycle *cycle)
 {
     if (!under_way || cycle->seq != frame_seq || cycle->left != left - 1) {
         frame_seq++;
-        if (cycle->left != app_live.repeats - 1 || cycle->seq != frame_seq || app.pause)
+        if (cycle->left != app_timing()->repeats - 1 || cycle->seq != frame_seq || app.pause)
             sg_light_gap(&app.light);
         if (under_way)                  // cycles of a frame that lost its last one
             sg_light_features(&app.light, app.feature);
