@@ -53,9 +53,9 @@ void hal_describe(struct sg_hello *hello);
 // below. After a reset by the watchdog the lights stay off for a second (hal_report's alarm says so).
 void hal_start(struct hal_timing *timing, uint16_t exposure_cycles[HAL_CHANNELS]);
 
-// One turn of the main loop: delivers what has arrived through the up-calls, moves slow writes on, and feeds
-// the watchdog if, and only if, a new sensing cycle has come since it last did. Returns 0 when the port has
-// ended.
+// One turn of the main loop: delivers what has arrived through the up-calls, moves slow writes and plans on,
+// and feeds the watchdog if, and only if, a new sensing cycle has come since it last did, or a pause between
+// frames goes on. Returns 0 when the port has ended.
 int hal_poll(void);
 
 // Device time, microseconds since boot; wraps after 2^32.
