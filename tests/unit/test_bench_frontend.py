@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark of the front end: its study against closed forms, its bars can fail, its report has its keys."""
+"""The benchmark of the front end: its study against closed forms, its bars can fail, its report has its
+keys."""
 
 import json
 import sys
@@ -10,7 +11,15 @@ import numpy as np
 import pytest
 
 BENCH = Path(__file__).resolve().parents[2] / "tools" / "bench"
-BITS = {"method", "adc_khz", "exposure_us", "photocurrent_na", "random_bits", "static_bits", "feasible_at_1khz"}
+BITS = {
+    "method",
+    "adc_khz",
+    "exposure_us",
+    "photocurrent_na",
+    "random_bits",
+    "static_bits",
+    "feasible_at_1khz",
+}
 
 
 @pytest.fixture(scope="module")
@@ -19,27 +28,17 @@ def bench():
     sys.path.insert(0, str(BENCH))
     try:
         import bench_frontend
-        import frontend_board
-        import frontend_bound
         import frontend_judge
-        import frontend_latency
-        import frontend_measures
         import frontend_methods
         import frontend_node
         import frontend_patterns
         import frontend_physics
         import frontend_picture
-        import frontend_size
         import frontend_static
     finally:
         sys.path.remove(str(BENCH))
     return SimpleNamespace(
         run=bench_frontend,
-        board=frontend_board,
-        bound=frontend_bound,
-        latency=frontend_latency,
-        measures=frontend_measures,
-        size=frontend_size,
         judge=frontend_judge,
         methods=frontend_methods,
         node=frontend_node,
@@ -59,8 +58,14 @@ def method(bench, name):
 
 def test_the_junctions_charge_is_the_integral_of_its_capacitance(bench):
     reverse = np.linspace(-0.4, 5.0, 200_001)
-    summed = np.concatenate([[0.0], np.cumsum((reverse[1:] - reverse[:-1]) * bench.physics.junction_pf(
-        (reverse[1:] + reverse[:-1]) / 2))])
+    summed = np.concatenate(
+        [
+            [0.0],
+            np.cumsum(
+                (reverse[1:] - reverse[:-1]) * bench.physics.junction_pf((reverse[1:] + reverse[:-1]) / 2)
+            ),
+        ]
+    )
     charge = bench.physics.junction_pc(reverse)
     assert charge - charge[0] == pytest.approx(summed, abs=1e-6)
     assert bench.physics.junction_pf(0.0) == 40.0 and bench.physics.junction_pc(0.0) == 0.0
@@ -99,7 +104,7 @@ def test_noise_of_the_converter_grows_with_its_clock_as_the_constants_say(bench)
 def test_bits_are_those_of_an_ideal_converter(bench):
     rng = np.random.default_rng(1)
     reading = 1.0 + rng.random(200_000) * 0.01
-    quantised = np.round(reading * 2**9) / 2**9     # a full scale of 1: nine bits
+    quantised = np.round(reading * 2**9) / 2**9  # a full scale of 1: nine bits
     assert bench.physics.bits((quantised - reading).std()) == pytest.approx(9.0, abs=0.02)
     assert bench.physics.bits(np.nan) == 0
 
@@ -107,8 +112,10 @@ def test_bits_are_those_of_an_ideal_converter(bench):
 # -- methods -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [
-    "cathode_5v", "anode_supply", "zero_bias", "rail", "rail_ground", "rail_x4", "comparator_divider"])
+@pytest.mark.parametrize(
+    "name",
+    ["cathode_5v", "anode_supply", "zero_bias", "rail", "rail_ground", "rail_x4", "comparator_divider"],
+)
 @pytest.mark.parametrize("light", [(200, 0), (75, 0), (200, 2000)])
 def test_monte_carlo_and_closed_form_agree(bench, name, light):
     """4000 draws: standard error of a spread 1.1 %; first order leaves about as much."""
@@ -122,7 +129,8 @@ def test_monte_carlo_and_closed_form_agree(bench, name, light):
 
 
 def test_the_closed_form_of_the_chosen_point_by_hand(bench):
-    """200 nA for 131 us are 26.2 pC on some 47 pF: one LSB is 0.19 %, the converter 0.86 of it, the light 0.07 %."""
+    """200 nA for 131 us are 26.2 pC on some 47 pF: one LSB is 0.19 %, the converter 0.86 of it, the light
+    0.07 %."""
     closed = bench.methods.closed_form(bench.node.RAIL, 250, 131, 200, 0)
     lsb_pc = 1.1 / 1024 * 47
     light = 5e-3 / 2.0 / np.sqrt(13.1)
@@ -130,8 +138,10 @@ def test_the_closed_form_of_the_chosen_point_by_hand(bench):
 
 
 def test_the_papers_reading_loses_by_the_references_and_the_ripple(bench):
-    bits = {name: float(bench.physics.bits(bench.methods.closed_form(method(bench, name), 250, 131, 200, 0)))
-            for name in ("cathode_5v", "anode_supply", "zero_bias", "rail")}
+    bits = {
+        name: float(bench.physics.bits(bench.methods.closed_form(method(bench, name), 250, 131, 200, 0)))
+        for name in ("cathode_5v", "anode_supply", "zero_bias", "rail")
+    }
     assert bits["rail"] > bits["anode_supply"] + 1.0 > bits["cathode_5v"] + 1.0
     assert bits["rail"] > bits["zero_bias"] + 1.0
 
@@ -148,7 +158,9 @@ def test_more_ambient_light_than_fits_is_no_reading(bench):
 
 
 def test_reading_again_averages_the_converter_only(bench):
-    once, four = (bench.methods.closed_form(method(bench, name), 250, 131, 200, 0) for name in ("rail", "rail_x4"))
+    once, four = (
+        bench.methods.closed_form(method(bench, name), 250, 131, 200, 0) for name in ("rail", "rail_x4")
+    )
     assert 0.5 * once < four < 0.7 * once
 
 
@@ -165,15 +177,24 @@ def test_exposures_at_a_thousand_frames_are_those_of_the_slots(bench):
 @pytest.mark.parametrize("exposure_us", [64, 131])
 def test_self_calibration_removes_what_it_can(bench, exposure_us):
     raw, after = bench.static.error(method(bench, "rail_ground"), 250, exposure_us, 200, 0, 5)
-    assert raw > 0.05 and after < 0.003         # gain and bandgap go; what INL bends more than once stays
+    assert raw > 0.05 and after < 0.003  # gain and bandgap go; what INL bends more than once stays
     raw, after = bench.static.error(method(bench, "rail_any"), 250, exposure_us, 200, 0, 5)
-    assert after > 0.03                         # the memory of the channel before does not
+    assert after > 0.03  # the memory of the channel before does not
 
 
 def test_without_errors_of_parts_nothing_static_is_left(bench):
     part = bench.static.boards(5)[0]
-    perfect = SimpleNamespace(**{**vars(part), "junction": 1.0, "extra": 1.0, "offset_lsb": 0.0, "gain": 1.0,
-                                 "bandgap": 1.0, "inl": lambda x: 0.0 * x})
+    perfect = SimpleNamespace(
+        **{
+            **vars(part),
+            "junction": 1.0,
+            "extra": 1.0,
+            "offset_lsb": 0.0,
+            "gain": 1.0,
+            "bandgap": 1.0,
+            "inl": lambda x: 0.0 * x,
+        }
+    )
     raw, after = bench.static.one_part(method(bench, "rail_ground"), 250, 131, 200, 0, perfect)
     assert abs(raw) < 1e-6 and after < 1e-3
 
@@ -187,7 +208,9 @@ def test_every_pattern_senses_every_channel_once_and_fits(bench):
         most = bench.patterns.longest_us(name)
         assert most.min() > 30 and most.max() < 260
     chosen = bench.patterns.longest_us(bench.patterns.CHOSEN)
-    assert chosen[[5, 1, 2]] == pytest.approx(103.6, abs=0.1) and chosen[[0, 4, 3]] == pytest.approx(159.2, abs=0.1)
+    assert chosen[[5, 1, 2]] == pytest.approx(103.6, abs=0.1) and chosen[[0, 4, 3]] == pytest.approx(
+        159.2, abs=0.1
+    )
 
 
 def test_a_pattern_collects_from_those_that_emit(bench):
@@ -220,8 +243,9 @@ def test_the_study_is_reported_with_the_issues_keys_and_a_picture(bench, tmp_pat
     assert all(BITS <= set(row) for row in report["bits"])
     assert {row["method"] for row in report["bits"]} == {one.name for one in bench.node.METHODS}
     chosen = [row for row in report["bits"] if row["chosen"]]
-    assert chosen and all(row["feasible_at_1khz"] for row in chosen if row["photocurrent_na"] == 200
-                          and not row["ambient_na"])
+    assert chosen and all(
+        row["feasible_at_1khz"] for row in chosen if row["photocurrent_na"] == 200 and not row["ambient_na"]
+    )
     assert (tmp_path / "frontend.png").read_bytes()[:4] == b"\x89PNG"
     assert "met" in capsys.readouterr().out
 
@@ -236,7 +260,10 @@ def test_methods_that_disagree_with_their_closed_form_miss_the_bar(bench, tmp_pa
 
 
 def test_another_pattern_than_the_best_misses_the_bar(bench):
-    rows = [{"pattern": "a", "chosen": False, "s2s_mean_deg": 0.2}, {"pattern": "b", "chosen": True, "s2s_mean_deg": 0.3}]
+    rows = [
+        {"pattern": "a", "chosen": False, "s2s_mean_deg": 0.2},
+        {"pattern": "b", "chosen": True, "s2s_mean_deg": 0.3},
+    ]
     assert [bar["met"] for bar in bench.judge.bars({"patterns": rows})] == [False]
     assert [bar["met"] for bar in bench.judge.bars({"patterns": rows[1:]})] == [True]
 
@@ -245,176 +272,3 @@ def test_bad_words_are_refused(bench, capsys):
     for words in (["--only", "nothing"], ["--seeds", "0"]):
         with pytest.raises(SystemExit):
             bench.run.main(words)
-
-
-# -- the device's figures ------------------------------------------------------------------------------------
-
-
-def drawn_frames(bench, target, index, noise_deg, seed=0):
-    """Frames whose gaze is its target and normal noise per axis."""
-    rng = np.random.default_rng(seed)
-    frames = np.zeros(len(index), bench.board.FRAME)
-    frames["gaze_deg"] = target + noise_deg * rng.standard_normal(target.shape)
-    frames["flags"] = 1
-    frames["t_us"] = frames["seq"] = np.arange(len(index))
-    return frames
-
-
-def test_precision_of_white_noise_is_twice_its_deviation_and_averages_to_half(bench):
-    """RMS-S2S of white noise s per axis: sqrt(2) s sqrt(2) = 2 s; of means of four frames half that."""
-    places = bench.board.grid_places()
-    index = np.repeat(np.arange(len(places)), 400)
-    target = places[index]
-    found = bench.measures.judge_grid(drawn_frames(bench, target, index, 0.1), target, index)
-    assert found["s2s_deg"] == pytest.approx(0.2, rel=0.02)
-    assert found["s2s_250_deg"] == pytest.approx(0.1, rel=0.04)
-    assert found["error_deg"] == pytest.approx(0.1 * np.sqrt(np.pi / 2), rel=0.03)
-    assert found["bias_deg"] < 0.02 and found["valid"] == 1.0 and found["places"] == 25
-
-
-def test_frames_that_the_device_calls_no_gaze_are_no_precision_but_loss(bench):
-    places = bench.board.grid_places()
-    index = np.repeat(np.arange(len(places)), 100)
-    target = places[index]
-    frames = drawn_frames(bench, target, index, 0.1)
-    frames["gaze_deg"][::2] += 40
-    frames["flags"][::2] = 4
-    found = bench.measures.judge_grid(frames, target, index)
-    assert found["s2s_deg"] == pytest.approx(0.2, rel=0.05) and found["valid"] == 0.5
-
-
-def test_a_step_settles_when_its_error_does(bench):
-    """30 steps; for 7 frames the error is five times the steady one, 3 of them saturated."""
-    rng = np.random.default_rng(4)
-    n, begin = 30 * 100, np.arange(0, 3000, 100)
-    frames = np.zeros(n, bench.board.FRAME)
-    error = np.abs(rng.normal(0.5, 0.1, n))
-    since = np.arange(n) % 100
-    error[since < 7] *= 5
-    frames["flags"] = np.where(since < 3, 8, 1)
-    error[since < 3] = np.nan
-    found = bench.measures.judge_steps(frames, error, begin)
-    assert found["settle_frames"] == 7 and found["saturated_frames"] == 3
-    assert found["steady_deg"] == pytest.approx(0.5, rel=0.03)
-
-
-def test_a_step_that_never_settles_has_no_number_of_frames(bench):
-    frames = np.zeros(1000, bench.board.FRAME)
-    error = np.ones(1000)
-    error[np.arange(1000) % 100 >= 50] = 0.5
-    assert bench.measures.judge_steps(frames, error, np.arange(0, 1000, 100))["settle_frames"] is None
-
-
-def cycle_log(begin, exposure=1600, slot=888):
-    """Log rows of one sensing cycle as the virtual Nano writes them, and the instants of its six lit samples."""
-    rows, middles = [], []
-    for phase, (first, second) in enumerate(((5, 0), (1, 4), (2, 3))):
-        start = begin + 6 * slot * phase
-        for place, (channel, mask) in enumerate(
-            [(15, 0), (first, 63 & ~(1 << first | 1 << second)), (second, 0), (15, 0), (first, 0), (second, 0)]
-        ):
-            sample = start + place * slot
-            lit = place in (1, 2)
-            if channel < 6:
-                rows.append((f"drive{channel}:3", sample - exposure))
-                if lit:
-                    middles.append(sample - exposure / 2)
-            rows.append((f"adc:{channel}", sample))
-            rows += [(f"lit:{mask}", start + slot - exposure - 80)] if place == 1 else []
-            rows += [("lit:0", sample + 132)] if place == 2 else []
-    return rows, middles
-
-
-def test_latency_is_read_off_the_log_of_pins_and_bytes(bench, tmp_path):
-    rows = []
-    for k in range(40):
-        one, middles = cycle_log(20_000 + 16_000 * k)
-        rows += one
-        last = max(cycle for event, cycle in one if event.startswith("adc"))
-        rows.append(("delimiter", last + 9_000 + 16 * (k % 2)))
-        if k == 5:
-            rows.append(("delimiter", last + 12_000))       # an answer to a ping: this frame is left out
-    rows.sort(key=lambda row: row[1])
-    path = tmp_path / "frames.csv"
-    path.write_text("event,cycle\n" + "".join(f"{event},{cycle}\n" for event, cycle in rows))
-    found = bench.latency.latency(path)
-    one, middles = cycle_log(0)
-    span = max(cycle for event, cycle in one if event.startswith("adc")) - np.mean(middles)
-    assert found["frames"] == 38
-    assert found["latency_last_ms"] == pytest.approx(9_008 / 16_000, abs=1e-3)
-    assert found["latency_last_max_ms"] == pytest.approx(9_016 / 16_000)
-    assert found["latency_mean_max_ms"] == pytest.approx((span + 9_016) / 16_000)
-
-
-def good_report():
-    """A report that meets every bar of the device."""
-    names = ("room", "bright_room", "sun_gap")
-    return {
-        "quick": False, "rate_hz": 1001.0, "seconds": 60.0, "late": 0, "lost": 0, "truth_ratio": 1.01, "n_vectors": 30,
-        "latency_mean_ms": 1.0, "latency_last_ms": 0.5, "latency_mean_max_ms": 2.0, "latency_last_max_ms": 1.2, "s2s_deg": 0.3, "s2s_250_deg": 0.15,
-        "error_ratio": dict.fromkeys(names, 1.0), "error_ratio_250": dict.fromkeys(names, 1.0),
-        "valid": dict.fromkeys(names, 0.9), "valid_250": dict.fromkeys(names, 0.9),
-        "saturated_after": dict.fromkeys(names, 0), "step": {"saturated_frames": 2, "settle_frames": 6},
-        "exposure_shift_over_s2s": 0.4, "flicker_ratio": 1.1, "flicker_ratio_250": 1.1, "irradiance_w_m2": {"normal": 20.0}, "margin": 1.2,
-        "flash": {"spare": 0.12}, "stack_free": 210,
-    }
-
-
-def test_a_good_report_meets_every_bar_and_64_vectors_are_an_aim(bench):
-    bars = bench.judge.bars(good_report())
-    assert all(bar["met"] for bar in bars if bar["kind"] == "bar") and len(bars) > 20
-    assert [bar["name"] for bar in bars if not bar["met"]] == ["* n_vectors"]
-
-
-@pytest.mark.parametrize("key, value", [
-    ("rate_hz", 999.0), ("late", 1), ("lost", 1), ("truth_ratio", 1.06), ("latency_mean_ms", 2.6),
-    ("latency_last_ms", 1.6), ("s2s_deg", 0.36), ("s2s_250_deg", 0.19), ("exposure_shift_over_s2s", 1.1),
-    ("flicker_ratio_250", 1.3), ("margin", 0.9), ("stack_free", 204), ("seconds", 10.0), ("late", None)])
-def test_every_bar_can_be_missed(bench, key, value):
-    report = {**good_report(), key: value}
-    assert sum(not bar["met"] for bar in bench.judge.bars(report) if bar["kind"] == "bar") == 1
-
-
-@pytest.mark.parametrize("key, part, value", [
-    ("error_ratio_250", "room", 1.2), ("error_ratio_250", "sun_gap", 3.1), ("saturated_after", "room", 1), ("valid_250", "sun_gap", 0.7),
-    ("step", "saturated_frames", 6), ("step", "settle_frames", None), ("flash", "spare", 0.09),
-    ("irradiance_w_m2", "normal", 101.0)])
-def test_every_bar_of_several_can_be_missed(bench, key, part, value):
-    report = good_report()
-    report[key] = {**report[key], part: value}
-    assert sum(not bar["met"] for bar in bench.judge.bars(report) if bar["kind"] == "bar") == 1
-
-
-def test_a_missed_bar_is_named_and_the_exit_code_is_one(bench, tmp_path, capsys):
-    report = {**good_report(), "rate_hz": 900.0, "seconds": 60.0}
-    report["bars"] = bench.judge.bars(report)
-    assert bench.judge.tell(report, tmp_path) == 1
-    assert "bar missed: * rate_hz" in capsys.readouterr().err
-
-
-def test_the_bound_is_that_of_independent_readings(bench, monkeypatch):
-    """Two channels, each telling one axis by 0.01 a degree, with 0.2 % of noise: 0.2 deg per axis."""
-    slopes = np.array([[0.01, 0.0], [0.0, 0.01]])
-    monkeypatch.setattr(bench.bound, "slopes", lambda *_: slopes)
-    found = bench.bound.bound_deg("", (0, 0), 3.5, np.full(2, 0.002))
-    assert found == pytest.approx(np.sqrt(2 * 2 * 0.2**2))
-
-
-def test_size_reads_an_elf_and_refuses_what_is_none(bench, tmp_path):
-    from sparsegaze.errors import SparsegazeError
-
-    with pytest.raises(SparsegazeError, match="no 32-bit ELF"):
-        (tmp_path / "x.elf").write_bytes(b"hello")
-        bench.size.size(tmp_path / "x.elf")
-    with pytest.raises(SparsegazeError, match="cannot read"):
-        bench.size.size(tmp_path / "none.elf")
-
-
-def test_size_counts_what_is_flashed(bench, firmware_elf, firmware_hex):
-    """Bytes of data records of the hex: type 00, their count the first byte."""
-    rows = firmware_hex.read_text().split()
-    flashed = sum(int(row[1:3], 16) for row in rows if row[7:9] == "00")
-    found = bench.size.size(firmware_elf)
-    assert found["flash"]["bytes"] == pytest.approx(flashed, abs=2)
-    assert found["flash"]["spare"] == pytest.approx(1 - (flashed + 4096 + 512) / 32768, abs=1e-3)
-    assert 0 < found["ram"]["bytes"] < 2048

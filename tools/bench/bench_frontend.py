@@ -3,12 +3,12 @@
 
     python tools/bench/bench_frontend.py [--quick] [--seeds 5] [--only methods,...]
 
-Writes frontend.json and frontend.png into build/bench. `make bench-frontend` calls this. Sections: methods (ways
-to read a photocurrent, by closed form and Monte Carlo), patterns (which LEDs emit while which sense), device (the
-shipped firmware on virtual Nanos, in device time, with simulated persons), safety (light on the eye, by the
-formulae of IEC 62471), size (flash, RAM, stack). A section that is not run keeps no figure of an earlier run. The
-worst seed is reported. Maps and calibrations are kept in build/bench/frontend as long as what made them has not
-changed. Exits 1 when a bar is missed, naming it.
+Writes frontend.json and frontend.png into build/bench. `make bench-frontend` calls this. Sections: methods
+(ways to read a photocurrent, by closed form and Monte Carlo), patterns (which LEDs emit while which
+sense), device (the shipped firmware on virtual Nanos, in device time, with simulated persons), safety
+(light on the eye, by the formulae of IEC 62471), size (flash, RAM, stack). A section that is not run keeps
+no figure of an earlier run. The worst seed is reported. Maps and calibrations are kept in
+build/bench/frontend as long as what made them has not changed. Exits 1 when a bar is missed, naming it.
 """
 
 import argparse
@@ -25,7 +25,13 @@ from sparsegaze.errors import SparsegazeError
 
 ROOT = Path(__file__).resolve().parents[2]
 SECTIONS = ("methods", "patterns", "device", "safety", "size")
-SEEDS = (2000, 2001, 2002, 2003, 2004)  # the headset's aims were never searched or tuned on persons from 2000 on
+SEEDS = (
+    2000,
+    2001,
+    2002,
+    2003,
+    2004,
+)  # the headset's aims were never searched or tuned on persons from 2000 on
 
 
 def main(words=None):
@@ -33,7 +39,9 @@ def main(words=None):
     formatter = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=formatter)
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "bench", help="default build/bench")
-    parser.add_argument("--quick", action="store_true", help="one person, everything short: to see that it runs")
+    parser.add_argument(
+        "--quick", action="store_true", help="one person, everything short: to see that it runs"
+    )
     parser.add_argument("--seeds", type=int, default=len(SEEDS), help="simulated persons (default 5)")
     parser.add_argument("--only", default=",".join(SECTIONS), help="sections, with commas (default all)")
     options = parser.parse_args(words)
@@ -61,7 +69,13 @@ def run(wanted, options):
     clock, folder = Clock(), options.out / "frontend"
     folder.mkdir(parents=True, exist_ok=True)
     seeds = [SEEDS[0] + k for k in range(1 if options.quick else options.seeds)]
-    report = {"quick": options.quick, "seeds": seeds, "simulated": True, "machine": machine(), "section_seconds": {}}
+    report = {
+        "quick": options.quick,
+        "seeds": seeds,
+        "simulated": True,
+        "machine": machine(),
+        "section_seconds": {},
+    }
 
     def section(name, make):
         if name not in wanted:
@@ -90,9 +104,14 @@ def methods(quick, say):
     draws = 500 if quick else 1000
     rows = frontend_methods.table(draws)
     apart = [row["drawn_bits"] - row["random_bits"] for row in rows if (row["random_bits"] or 0) > 1]
-    chosen = next(row for row in rows if row["chosen"] and row["photocurrent_na"] == 200 and not row["ambient_na"])
+    chosen = next(
+        row for row in rows if row["chosen"] and row["photocurrent_na"] == 200 and not row["ambient_na"]
+    )
     say(f"{len(rows)} rows; Monte Carlo and closed form at most {max(map(abs, apart)):.2f} bits apart")
-    say(f"chosen: {chosen['random_bits']} bits of noise, {chosen['static_bits']} static after self-calibration")
+    say(
+        f"chosen: {chosen['random_bits']} bits of noise, "
+        f"{chosen['static_bits']} static after self-calibration"
+    )
     return {"bits": rows, "bits_apart": max(map(abs, apart)), "bits_draws": draws}
 
 

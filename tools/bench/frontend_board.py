@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A calibrated virtual Nano with the shipped firmware: whose eye goes where it is told, whose stream is an array.
+"""A calibrated virtual Nano with the shipped firmware: whose eye goes where it is told, whose stream is an
+array.
 
-Calibrations are kept by the hash of what makes them: firmware, virtual Nano, map, physics and the SDK's fitting.
+Calibrations are kept by the hash of what makes them: firmware, virtual Nano, map, physics and the SDK's
+fitting.
 """
 
 import hashlib
@@ -20,11 +22,25 @@ from sparsegaze.wire import lib
 
 ROOT = Path(__file__).resolve().parents[2]
 FIRMWARE = ROOT / "host_sdk" / "sparsegaze" / "data" / "firmware.hex"
-SOURCES = ("linearity", "calibrate", "capture", "session", "selection", "distil", "gp", "choose", "trustfit", "rounding")
+SOURCES = (
+    "linearity",
+    "calibrate",
+    "capture",
+    "session",
+    "selection",
+    "distil",
+    "gp",
+    "choose",
+    "trustfit",
+    "rounding",
+)
 CALIBRATION_TARGETS, RATE_HZ = 120, 1000
 LEAST_VECTORS, FEWER = 12, 3  # when the model of calibrate's choice makes fewer frames than RATE_HZ
 GRID_DEG = (-20.0, -10.0, 0.0, 10.0, 20.0)
-DWELL_S, SKIP_S = 0.25, 0.07  # a grid's target; what of it is not looked at, because exposures follow the jump
+DWELL_S, SKIP_S = (
+    0.25,
+    0.07,
+)  # a grid's target; what of it is not looked at, because exposures follow the jump
 LEAD_US = 20_000
 FRAME = np.dtype(
     [("seq", "i8"), ("t_us", "i8"), ("gaze_deg", "f8", (2,)), ("flags", "u1"), ("features", "u2", (6,))]
@@ -96,7 +112,8 @@ class Board:
         self.control.target(self.now_us(), azimuth_deg, elevation_deg)
 
     def grid(self, places=None, dwell_s=DWELL_S, skip_s=SKIP_S, gaze=True, raw=False):
-        """Frames over places [k, 2] (the grid within +-20 degrees), one after the other, with their targets.
+        """Frames over places [k, 2] (the grid within +-20 degrees), one after the other, with their
+        targets.
 
         Returns (frames, target_deg [n, 2], index [n]); index -1 while a place is new.
         """
@@ -141,7 +158,8 @@ def key_of(seed, light):
 
 
 def calibrated(seed, light, folder, say):
-    """(state folder of a Nano that holds firmware and model of this person at this light, dict of what it took)."""
+    """(state folder of a Nano that holds firmware and model of this person at this light, dict of what it
+    took)."""
     key = key_of(seed, light)
     place = folder / f"{seed}-{light}-{key}"
     known = place / "calibration.json"

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The physical limit of precision: Cramer-Rao bound from a person's map with the converter's noise.
 
-The bound is that of an unbiased estimate of azimuth and elevation from the six photocurrents of one frame, the pupil
-known. Photocurrents are those measured (part spread and all), their relative slopes the map's with nominal parts,
-their noise that of frontend_methods.closed_form at the exposures in force. A model that smooths is not unbiased and
-may be quieter; one that spends light on telling the pupil is louder.
+The bound is that of an unbiased estimate of azimuth and elevation from the six photocurrents of one frame,
+the pupil known. Photocurrents are those measured (part spread and all), their relative slopes the map's
+with nominal parts, their noise that of frontend_methods.closed_form at the exposures in force. A model
+that smooths is not unbiased and may be quieter; one that spends light on telling the pupil is louder.
 """
 
 import frontend_methods
@@ -26,7 +26,8 @@ PLACE_S, SKIP_S = 0.16, 0.06
 def noise(board, map_path, light):
     """Measured noise of the features beside the expected, and the bound: a dict.
 
-    ratio [6]   measured over expected RMS, mean over the grid; bound_deg, bound_250_deg   RMS-S2S, mean over the grid
+    ratio [6]   measured over expected RMS, mean over the grid; bound_deg, bound_250_deg   RMS-S2S, mean
+    over the grid
     """
     frames, _, index = board.grid(dwell_s=PLACE_S, skip_s=SKIP_S, gaze=False, raw=True)
     exposure = np.array(board.device.exposure().exposure_us)

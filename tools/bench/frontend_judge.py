@@ -34,7 +34,9 @@ def bars(report):
         least("bits: rows of the chosen point", len(chosen), 1)
     if report.get("patterns"):
         best = report["patterns"][0]
-        most("patterns: chosen over best, RMS-S2S", _chosen(report)["s2s_mean_deg"] / best["s2s_mean_deg"], 1.0)
+        most(
+            "patterns: chosen over best, RMS-S2S", _chosen(report)["s2s_mean_deg"] / best["s2s_mean_deg"], 1.0
+        )
     if "rate_hz" in report:
         least("* rate_hz, gaze on the wire, device time", report["rate_hz"], RATE_HZ)
         least("* rate: seconds streamed", report["seconds"], 3.0 if report["quick"] else 59.9)
@@ -59,7 +61,11 @@ def bars(report):
         most("step.saturated_frames", report["step"]["saturated_frames"], STEP_SATURATED)
         most("step.settle_frames", report["step"]["settle_frames"], STEP_SETTLE)
         most("exposure_shift_deg over RMS-S2S", report["exposure_shift_over_s2s"], 1.0)
-        most("flicker_ratio_250, over steady light, set to 4 cycles a frame", report["flicker_ratio_250"], FLICKER)
+        most(
+            "flicker_ratio_250, over steady light, set to 4 cycles a frame",
+            report["flicker_ratio_250"],
+            FLICKER,
+        )
         most("flicker_ratio, over steady light, default setting", report["flicker_ratio"], FLICKER, "aim")
     if "irradiance_w_m2" in report:
         for case, value in report["irradiance_w_m2"].items():

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Latency in exact cycles, from the virtual Nano's log of pins, samples and sent bytes (`frames on`).
 
-Rows event,cycle: lit:<mask> emitters that light from then on; drive<i>:<how> pin i (3: floating); adc:<channel> the
-instant of a sample; delimiter the end of a sent packet's last byte. A sensing cycle has six lit samples of channels
-0..5 and six unlit ones; a frame's time is the mean of the middles of its six lit exposures.
+Rows event,cycle: lit:<mask> emitters that light from then on; drive<i>:<how> pin i (3: floating);
+adc:<channel> the instant of a sample; delimiter the end of a sent packet's last byte. A sensing cycle has
+six lit samples of channels 0..5 and six unlit ones; a frame's time is the mean of the middles of its six
+lit exposures.
 """
 
 import csv
@@ -24,7 +25,8 @@ def read(path):
 
 
 def cycles_of(rows):
-    """(mean [n], last [n], sent [m]): mean sample time and last sample of every sensing cycle, ends of packets."""
+    """(mean [n], last [n], sent [m]): mean sample time and last sample of every sensing cycle, ends of
+    packets."""
     lit, released, middles, samples, sent = 0, {}, [], [], []
     mean, last, before = [], [], None
     for event, cycle in rows:
@@ -39,7 +41,7 @@ def cycles_of(rows):
         elif kind == "adc" and int(value) < CHANNELS:
             channel = int(value)
             if lit and before is not None and not before[1] and len(middles) == CHANNELS:
-                middles, samples = [], []       # the first pair again
+                middles, samples = [], []  # the first pair again
             before = (channel, lit)
             samples.append(cycle)
             if lit and channel in released:
@@ -52,7 +54,8 @@ def cycles_of(rows):
 
 
 def latency(path):
-    """Milliseconds of device time from mean and last sample to the last byte of the gaze, mean and maximum.
+    """Milliseconds of device time from mean and last sample to the last byte of the gaze, mean and
+    maximum; and how evenly the last samples follow each other.
 
     Of frames after which just one packet was sent before the next was due: answers to pings are left out.
     """
@@ -60,12 +63,17 @@ def latency(path):
     first = np.searchsorted(sent, last[:-1], side="right")
     alone = np.searchsorted(sent, last[1:], side="right") - first == 1
     if not alone.any():
-        raise SparsegazeError("no frame in the virtual Nano's log whose bytes can be told apart", "run it longer")
+        raise SparsegazeError(
+            "no frame in the virtual Nano's log whose bytes can be told apart", "run it longer"
+        )
     ends = sent[first[alone]]
     from_mean = (ends - mean[:-1][alone]) / CYCLES_PER_MS
     from_last = (ends - last[:-1][alone]) / CYCLES_PER_MS
+    period = np.diff(last)
     return {
         "frames": int(alone.sum()),
+        "period_cycles": int(np.median(period)),
+        "jitter_cycles": int(np.ptp(period[period < 1.5 * np.median(period)])),
         "latency_mean_ms": float(from_mean.mean()),
         "latency_mean_max_ms": float(from_mean.max()),
         "latency_last_ms": float(from_last.mean()),

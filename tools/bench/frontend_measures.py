@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is measured on a calibrated board (frontend_board.Board): one function a row of the benchmark's table."""
+"""What is measured on a calibrated board (frontend_board.Board): one function a row of the benchmark's
+table."""
 
 import numpy as np
 from frontend_board import error_deg, valid
@@ -58,7 +59,8 @@ def judge_grid(frames, target, index):
 
 
 def ambient(board, name, repeats=1):
-    """precision() in an ambient light of physics.toml, and how many frames after its coming were saturated."""
+    """precision() in an ambient light of physics.toml, and how many frames after its coming were
+    saturated."""
     board.device.settings(repeats=repeats)
     rest(board)
     board.control.set("ambient", name)
@@ -112,7 +114,9 @@ def steps(board, repeats, rng, place=(4.0, -6.0)):
     for k in range(2 * repeats):
         moment += int(STEP_S * 1e6) + int(rng.integers(0, 2000))
         at.append(moment)
-        board.control.set_at(int(moment * CPU_MHZ) + int(rng.integers(0, 16)), "ambient_na", STEP_NA[(k + 1) % 2])
+        board.control.set_at(
+            int(moment * CPU_MHZ) + int(rng.integers(0, 16)), "ambient_na", STEP_NA[(k + 1) % 2]
+        )
     frames = board.frames((at[-1] - board.now_us()) * 1e-6 + 2 * STEP_S)
     rest(board)
     error = error_deg(frames, np.tile(place, (len(frames), 1)))
@@ -124,7 +128,8 @@ def judge_steps(frames, error, begin):
     """Saturated frames of the worst step, frames until settled, errors by frame after the step.
 
     begin   [k] index of the first frame after each step
-    settled: the mean over steps and a window of WINDOW frames, all of them valid, within SETTLED of the steady one
+    settled: the mean over steps and a window of WINDOW frames, all of them valid, within SETTLED of the
+    steady one
     """
     rows = begin[:, None] + np.arange(STEADY.stop)
     rows = rows[rows[:, -1] < len(frames)]
@@ -135,7 +140,10 @@ def judge_steps(frames, error, begin):
     settle = None
     for k in range(STEADY.start):
         window = table[:, k : k + WINDOW]
-        if whole[:, k : k + WINDOW].mean() >= 0.99 and np.mean(window, where=np.isfinite(window)) <= SETTLED * steady:
+        if (
+            whole[:, k : k + WINDOW].mean() >= 0.99
+            and np.mean(window, where=np.isfinite(window)) <= SETTLED * steady
+        ):
             settle = k
             break
     course = [float(np.nanmean(column)) if np.isfinite(column).any() else None for column in table.T]
@@ -143,7 +151,9 @@ def judge_steps(frames, error, begin):
         "saturated_frames": int(saturated.max()),
         "settle_frames": settle,
         "steady_deg": steady,
-        "worst_valid_deg": float(np.max(table[:, : STEADY.start], initial=0.0, where=whole[:, : STEADY.start])),
+        "worst_valid_deg": float(
+            np.max(table[:, : STEADY.start], initial=0.0, where=whole[:, : STEADY.start])
+        ),
         "steady_worst_deg": float(np.max(table[:, STEADY], initial=0.0, where=whole[:, STEADY])),
         "course_deg": course,
         "valid": [float(v) for v in whole.mean(axis=0)],

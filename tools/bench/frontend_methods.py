@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ways to read a photocurrent off an LED, compared: random noise and static error against exposure time.
 
-Each reading is lit minus unlit over the exposure; in the dark the unlit one is averaged over UNLIT_MEAN frames,
-in ambient light it is the newest alone. Random noise is drawn (monte_carlo) and computed (closed_form); static
-error is the spread over drawn parts (frontend_static.py), as they come (`raw`: gain, offset, bandgap,
-capacitance, crosstalk) and after self-calibration, which learns gain and curvature of each channel, while the
-exposure ranges over a quarter of itself to itself.
+Each reading is lit minus unlit over the exposure; in the dark the unlit one is averaged over UNLIT_MEAN
+frames, in ambient light it is the newest alone. Random noise is drawn (monte_carlo) and computed
+(closed_form); static error is the spread over drawn parts (frontend_static.py), as they come (`raw`: gain,
+offset, bandgap, capacitance, crosstalk) and after self-calibration, which learns gain and curvature of
+each channel, while the exposure ranges over a quarter of itself to itself.
 """
 
 import frontend_physics as physics
@@ -36,9 +36,17 @@ def monte_carlo(method, adc_khz, exposure_us, photocurrent_na, ambient_na, rng, 
     if method.reader != "adc":
         return _drawn_crossings(method, node, exposure_us, photocurrent_na, ambient_na, rng, n)
     bright = physics.emission_noise(method.headroom_v, exposure_us) * rng.standard_normal((1, n))
-    more = photocurrent_na * bright * (slope(node, exposure_us, lit_na) if method.bias_v == 0 else exposure_us * 1e-3)
+    more = (
+        photocurrent_na
+        * bright
+        * (slope(node, exposure_us, lit_na) if method.bias_v == 0 else exposure_us * 1e-3)
+    )
     lit = _drawn_charge(method, node, adc_khz, lit_q + more, rng, (1, n))
-    dark = np.zeros((1, 1)) if method.name == "cathode_1v1" else _drawn_charge(method, node, adc_khz, unlit_q, rng, (unlit, n))
+    dark = (
+        np.zeros((1, 1))
+        if method.name == "cathode_1v1"
+        else _drawn_charge(method, node, adc_khz, unlit_q, rng, (unlit, n))
+    )
     found = lit.mean(0) - np.mean(dark, axis=0)
     if method.bias_v == 0:  # through the forward law: by the slope of charge over current
         found = found / slope(node, exposure_us, photocurrent_na + ambient_na)
@@ -148,10 +156,12 @@ def _closed_crossings(method, node, exposure_us, photocurrent_na, ambient_na):
 
 
 def longest_us(method, adc_khz):
-    """Longest exposures (first and second of a pair) with which six channels, lit and unlit, make 1000 frames/s.
+    """Longest exposures (first and second of a pair) with which six channels, lit and unlit, make 1000
+    frames/s.
 
-    (0, 0): not at this clock. A slot is one conversion; read once, a channel is exposed while others convert.
-    Held and read several times, nothing may shine meanwhile; a comparator serves one channel at a time.
+    (0, 0): not at this clock. A slot is one conversion; read once, a channel is exposed while others
+    convert. Held and read several times, nothing may shine meanwhile; a comparator serves one channel at a
+    time.
     """
     if method.reader != "adc":
         alone = FRAME_US / (2 * CHANNELS) - RESET_US

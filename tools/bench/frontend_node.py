@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Circuits that make a voltage of a photocurrent, and how they are read (frontend_methods.py compares them).
+"""Circuits that make a voltage of a photocurrent, and how they are read (frontend_methods.py compares
+them).
 
 A node starts held, is let go for an exposure, and has then swung by v because of the charge q it collected:
-q = F(b1) - F(b2 - v) + (Cp + Cs) v - Cs v_before (anode sensed; the cathode sensed alike, downwards), where F
-is the junction's charge law, b1 and b2 the bias at release and at sample with their noise, Cs the sample
-capacitor and v_before what it held.
+q = F(b1) - F(b2 - v) + (Cp + Cs) v - Cs v_before (anode sensed; the cathode sensed alike, downwards),
+where F is the junction's charge law, b1 and b2 the bias at release and at sample with their noise, Cs the
+sample capacitor and v_before what it held.
 """
 
 from dataclasses import dataclass, replace
@@ -30,7 +31,9 @@ class Method:
     bias_noise_v: float = physics.RAIL_NOISE_V
     cathode: bool = False  # sensed, held at the supply; else the anode, held at ground
     reference: str = "bandgap"
-    before: str = "subtracted"  # the sample capacitor's content: ground | subtracted (first of a pair: ground) | any
+    before: str = (
+        "subtracted"  # the sample capacitor's content: ground | subtracted (first of a pair: ground) | any
+    )
     reads: int = 1
     reader: str = "adc"  # adc | bandgap (comparator) | divider (comparator)
 
@@ -76,7 +79,8 @@ def node_of(method, junction=1.0, extra=1.0, forward_na=P.node.leakage_na):
 class Node:
     """Swing against charge of one method's node, ideal or with drawn capacitances.
 
-    junction, extra    relative capacitances: 1 is nominal;  forward_na    saturation current of the junction
+    junction, extra    relative capacitances: 1 is nominal;  forward_na    saturation current of the
+    junction
     """
 
     def __init__(self, method, junction=1.0, extra=1.0, forward_na=P.node.leakage_na):
@@ -89,9 +93,7 @@ class Node:
     def charge(self, v):
         """h(v): charge collected for a swing, noise and the sample capacitor's content apart."""
         bias = self.method.bias_v
-        return (
-            self.junction * (physics.junction_pc(bias) - physics.junction_pc(bias - v)) + self.extra_pf * v
-        )
+        return self.junction * (physics.junction_pc(bias) - physics.junction_pc(bias - v)) + self.extra_pf * v
 
     def capacitance(self, v):
         """dq/dv at a swing."""
@@ -130,7 +132,9 @@ def threshold_v(method, node, total_na, exposure_us):
 
 
 def threshold_noise_v(method, at):
-    return physics.BANDGAP_NOISE_V if method.reader == "bandgap" else physics.RAIL_NOISE_V / physics.RAIL_V * at
+    return (
+        physics.BANDGAP_NOISE_V if method.reader == "bandgap" else physics.RAIL_NOISE_V / physics.RAIL_V * at
+    )
 
 
 def readable(method, node, total_na, exposure_us):
@@ -143,8 +147,10 @@ def readable(method, node, total_na, exposure_us):
     if method.bias_v == 0:  # above, the junction carries away as much as it collects
         return v < 0.25
     code = (method.bias_v - v if method.cathode else v) / method.full_v * physics.CODES
-    return bool((0.02 * physics.CODES if method.cathode else 0) <= code < physics.FULL_CODE
-                or (method.reference == "supply" and code >= physics.FULL_CODE))
+    return bool(
+        (0.02 * physics.CODES if method.cathode else 0) <= code < physics.FULL_CODE
+        or (method.reference == "supply" and code >= physics.FULL_CODE)
+    )
 
 
 def slope(node, exposure_us, total_na):

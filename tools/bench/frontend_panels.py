@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Panels of frontend.png about the device: precision, ambient light, steps, flicker and shift, rate, light."""
+"""Panels of frontend.png about the device: precision, ambient light, steps, flicker and shift, rate,
+light."""
 
 import numpy as np
 from frontend_measures import AMBIENTS, STEADY
@@ -21,7 +22,9 @@ def _precision(axis, report):
     axis.axhline(0.35, color=RED, ls="--", lw=1)
     axis.axhline(0.18, color=RED, ls=":", lw=1)
     _persons(axis, rows)
-    axis.set(ylabel="RMS-S2S (deg)", title="Precision within +-20 deg (dashes: Cramer-Rao bound)", ylim=(0, None))
+    axis.set(
+        ylabel="RMS-S2S (deg)", title="Precision within +-20 deg (dashes: Cramer-Rao bound)", ylim=(0, None)
+    )
     axis.legend(fontsize=7, ncol=3)
 
 
@@ -55,7 +58,9 @@ def _ambient(axis, report):
     for k, name in enumerate(names):
         axis.plot([k - 0.3, k + 0.3], [RATIO_BARS[name]] * 2, "--", color=RED)
     axis.set_xticks(range(len(names)), labels=[name.replace("_", " ") for name in names])
-    axis.set(ylabel="error over the dark's", title="Gaze error in ambient light (dashed: bars)", ylim=(0.5, None))
+    axis.set(
+        ylabel="error over the dark's", title="Gaze error in ambient light (dashed: bars)", ylim=(0.5, None)
+    )
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8)
 
@@ -65,7 +70,9 @@ def _steps(axis, report):
         for k, row in enumerate(report["device"]):
             step = row["step"][name]
             course = [np.nan if value is None else value / step["steady_deg"] for value in step["course_deg"]]
-            axis.plot(course[: STEADY.start], color=colour, lw=0.9, label=f"{name} 1000:1" if k == 0 else None)
+            axis.plot(
+                course[: STEADY.start], color=colour, lw=0.9, label=f"{name} 1000:1" if k == 0 else None
+            )
     axis.axhline(1.1, color=GREY, ls="--", lw=1)
     axis.set(
         xlabel="frame after the step",
@@ -83,7 +90,9 @@ def _shift(axis, report):
     for table, shift, colour in (("flicker", -0.27, GREY), ("flicker_250", 0.0, ORANGE)):
         ratio = [flicker_ratio(row[table]) for row in rows]
         name = "250 Hz" if table == "flicker_250" else "1000 Hz"
-        axis.bar(place + shift, ratio, 0.27, color=colour, label=f"flicker over steady light, {name} (bar 1.2)")
+        axis.bar(
+            place + shift, ratio, 0.27, color=colour, label=f"flicker over steady light, {name} (bar 1.2)"
+        )
     moved = [row["shift"]["exposure_shift_deg"] / row["shift"]["s2s_deg"] for row in rows]
     axis.bar(place + 0.27, moved, 0.27, color=GREEN, label="moved by exposures, over RMS-S2S (bar 1)")
     axis.axhline(1.2, color=ORANGE, ls="--", lw=1)
@@ -106,7 +115,11 @@ def _stream(axis, report):
         axis.axhline(bar, color=colour, ls="--", lw=1)
     _persons(axis, rows)
     rate = min(row["stream"]["rate_hz"] for row in rows)
-    axis.set(ylabel="ms of device time", title=f"Latency to the last byte (dash: maximum), {rate:.1f} Hz", ylim=(0, None))
+    axis.set(
+        ylabel="ms of device time",
+        title=f"Latency to the last byte (dash: maximum), {rate:.1f} Hz",
+        ylim=(0, None),
+    )
     axis.legend(fontsize=8)
 
 

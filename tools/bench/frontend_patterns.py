@@ -2,11 +2,11 @@
 """Which LEDs emit while which sense: patterns compared on simulated persons, at 1000 frames/s.
 
 A pattern is a list of phases (sensors, in the order of their samples). Six channels are lit and read, then
-read unlit, phase by phase; slots follow each other as fast as the converter can at 250 kHz. The fewer phases,
-the longer the exposures, but the fewer LEDs emit. Every pattern gets the exposures that its slots allow, and
-automatic exposure: the geometric mean of a channel's light swings its node by GOAL_V, its brightest gaze by no
-more than MOST_V. Noise is that of frontend_methods.closed_form (rail); persons are calibrated with CALIBRATION
-noisy targets and judged by a Gaussian process in float64.
+read unlit, phase by phase; slots follow each other as fast as the converter can at 250 kHz. The fewer
+phases, the longer the exposures, but the fewer LEDs emit. Every pattern gets the exposures that its slots
+allow, and automatic exposure: the geometric mean of a channel's light swings its node by GOAL_V, its
+brightest gaze by no more than MOST_V. Noise is that of frontend_methods.closed_form (rail); persons are
+calibrated with CALIBRATION noisy targets and judged by a Gaussian process in float64.
 """
 
 import warnings
@@ -62,7 +62,8 @@ def longest_us(name):
 
 
 def collected(response, name, sensor, emitter):
-    """Photocurrents [n, 6], nA, of responses [n, sensor, emitter] under a pattern; parts: factors [6], [6]."""
+    """Photocurrents [n, 6], nA, of responses [n, sensor, emitter] under a pattern; parts: factors [6],
+    [6]."""
     out = np.empty((len(response), 6))
     for phase in PAIRS[name]:
         lit = [k for k in range(6) if k not in phase]
@@ -90,7 +91,8 @@ def exposures(current_na, most_us):
 
 
 def looks(path, seed):
-    """(calibration responses, targets, held-out responses) of a person: where the eye really looks, drawn."""
+    """(calibration responses, targets, held-out responses) of a person: where the eye really looks,
+    drawn."""
     rng = np.random.default_rng([seed, 7])
     pupil = float(np.clip(P.eye.pupil_mm + 0.8 * rng.normal(), 2.4, 5.5))
     plan = calibration_plan(CALIBRATION, seed).target_deg
@@ -105,7 +107,8 @@ def looks(path, seed):
 
 
 def judge(path, seed, name):
-    """RMS-S2S (deg, root mean square over held-out gazes) and least photocurrent of one person and pattern."""
+    """RMS-S2S (deg, root mean square over held-out gazes) and least photocurrent of one person and
+    pattern."""
     known, plan, held = looks(path, seed)
     rng = np.random.default_rng([seed, 99])
     spread = np.sqrt(np.log1p(P.photocurrent.part_spread**2))
@@ -135,7 +138,8 @@ def judge(path, seed, name):
 
 
 def table(paths, say=lambda text: None):
-    """Rows by pattern over persons {seed: map path}: mean and worst s2s_deg, exposures, noise; best first."""
+    """Rows by pattern over persons {seed: map path}: mean and worst s2s_deg, exposures, noise; best
+    first."""
     rows = []
     for name in PAIRS:
         each = [judge(path, seed, name) for seed, path in paths.items()]

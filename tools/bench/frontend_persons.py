@@ -23,5 +23,7 @@ def maps(seeds, say):
                 tenths.add(int(10 * done))
                 say(f"map of simulated person {seed}: {10 * int(10 * done)} %")
 
-        found[seed] = simulate.response_map(headset, draw_person(seed, P.eye.lid_follow_gain), progress=progress)
+        found[seed] = simulate.response_map(
+            headset, draw_person(seed, P.eye.lid_follow_gain), progress=progress
+        )
     return found

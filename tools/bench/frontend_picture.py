@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""frontend.png: what bench_frontend.py measured, one panel a question; a section not run leaves its panels out."""
+"""frontend.png: what bench_frontend.py measured, one panel a question; a section not run leaves its panels
+out."""
 
 import frontend_methods
 import matplotlib
@@ -63,7 +64,8 @@ def _rows(report, method, adc_khz, light):
 
 
 def _line(axis, rows, colour, label):
-    """Bits of noise over exposure: a strong line as far as six channels make 1000 frames/s, then a faint one."""
+    """Bits of noise over exposure: a strong line as far as six channels make 1000 frames/s, then a faint
+    one."""
     t, b = np.array([[row["exposure_us"], row["random_bits"]] for row in rows]).T
     fits = np.array([row["feasible_at_1khz"] for row in rows])
     axis.plot(t, b, "-", color=colour, lw=0.8, alpha=0.6)
@@ -72,7 +74,13 @@ def _line(axis, rows, colour, label):
 
 
 def _bits_axis(axis, title):
-    axis.set(xscale="log", xlabel="exposure (us)", ylabel="effective bits (random noise)", title=title, ylim=(0, 9.5))
+    axis.set(
+        xscale="log",
+        xlabel="exposure (us)",
+        ylabel="effective bits (random noise)",
+        title=title,
+        ylim=(0, 9.5),
+    )
     shown = [t for t in frontend_methods.EXPOSURES_US if t not in (103, 159)]
     axis.set_xticks(shown, labels=[str(t) for t in shown], fontsize=7)
     axis.minorticks_off()
@@ -85,7 +93,9 @@ def _mark(axis, report, light):
     for row in _rows(report, name, adc_khz, light):
         if row["exposure_us"] == exposure_us:
             axis.plot(exposure_us, row["random_bits"], "*", color="black", ms=15, zorder=5)
-            axis.annotate("chosen", (exposure_us, row["random_bits"]), (exposure_us * 1.25, row["random_bits"] - 1.1))
+            axis.annotate(
+                "chosen", (exposure_us, row["random_bits"]), (exposure_us * 1.25, row["random_bits"] - 1.1)
+            )
 
 
 def _methods(axis, report, light=(200, 0)):
@@ -103,7 +113,12 @@ def _light(axis, report):
     for light, colour in zip(frontend_methods.LIGHTS, colours):
         rows = _rows(report, name, adc_khz, light)
         if rows:
-            _line(axis, rows, colour, f"{light[0]} nA" + (f" beside {light[1]} nA ambient" if light[1] else ", dark"))
+            _line(
+                axis,
+                rows,
+                colour,
+                f"{light[0]} nA" + (f" beside {light[1]} nA ambient" if light[1] else ", dark"),
+            )
     _bits_axis(axis, "The chosen method by light")
 
 
@@ -129,7 +144,9 @@ def _static(axis, report):
     axis.barh(place + 0.2, after, 0.4, color=BLUE, label="after self-calibration")
     axis.barh(place - 0.2, before, 0.4, color=GREY, label="as the parts come")
     axis.set_yticks(place, labels=names, fontsize=7)
-    axis.set(xlabel="effective bits (static error)", title=f"Static error, 200 nA for {exposure} us", xlim=(0, 16))
+    axis.set(
+        xlabel="effective bits (static error)", title=f"Static error, 200 nA for {exposure} us", xlim=(0, 16)
+    )
     axis.invert_yaxis()
     axis.legend(fontsize=7)
 

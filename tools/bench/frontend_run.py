@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The section device: simulated persons on virtual Nanos with the shipped firmware, and the worst of them.
 
-Each person is calibrated by the product's own calibration at each light, in lockstep; everything else is measured
-on those models: in ambient light, on steps, in flicker and with held exposures on the one calibrated in the dark
-at nominal light.
+Each person is calibrated by the product's own calibration at each light, in lockstep; everything else is
+measured on those models: in ambient light, on steps, in flicker and with held exposures on the one
+calibrated in the dark at nominal light.
 """
 
 import json
@@ -85,9 +85,14 @@ def _nominal(board, row, quick, rng, folder):
 
 
 def _bounds(row, map_path):
-    """The physical limit beside the precision in steady light: room and bright room flicker, which costs more."""
+    """The physical limit beside the precision in steady light: room and bright room flicker, which costs
+    more."""
     noise = row["noise"]["nominal"]
-    for name, na in (("room", P.ambient.room_na), ("bright_room", P.ambient.bright_room_na), ("sun_gap", P.ambient.sun_gap_na)):
+    for name, na in (
+        ("room", P.ambient.room_na),
+        ("bright_room", P.ambient.bright_room_na),
+        ("sun_gap", P.ambient.sun_gap_na),
+    ):
         for table, repeats in (("ambient", 1), ("ambient_250", SLOW_REPEATS)):
             found = row[table][name]
             bound = frontend_bound.in_ambient(noise, map_path, noise["pupil_mm"], found["exposure_us"], na)
@@ -101,7 +106,9 @@ def _short(found):
 def line_of(row):
     """One line of a person's figures."""
     stream, ambient = row["stream"], row["ambient"]
-    ratio = {name: ambient[name]["error_deg"] / ambient["dark"]["error_deg"] for name in measures.AMBIENTS[1:]}
+    ratio = {
+        name: ambient[name]["error_deg"] / ambient["dark"]["error_deg"] for name in measures.AMBIENTS[1:]
+    }
     return (
         f"person {row['seed']}: {stream['rate_hz']:.1f} Hz, late {stream['late']}, lost {stream['lost']}, "
         + ", ".join(f"{name} x{value:.2f}" for name, value in ratio.items())
@@ -131,9 +138,17 @@ def worst(rows):
         "frame_cycles_max": most(lambda row: row["stream"]["frame_cycles_max"]),
         "stack_free": min(row["stream"]["stack_free"] for row in rows),
         "exposure_shift_deg": most(lambda row: row["shift"]["exposure_shift_deg"]),
-        "exposure_shift_over_s2s": most(lambda row: row["shift"]["exposure_shift_deg"] / row["shift"]["s2s_deg"]),
+        "exposure_shift_over_s2s": most(
+            lambda row: row["shift"]["exposure_shift_deg"] / row["shift"]["s2s_deg"]
+        ),
     }
-    for key in ("latency_mean_ms", "latency_mean_max_ms", "latency_last_ms", "latency_last_max_ms"):
+    for key in (
+        "latency_mean_ms",
+        "latency_mean_max_ms",
+        "latency_last_ms",
+        "latency_last_max_ms",
+        "jitter_cycles",
+    ):
         out[key] = most(lambda row, key=key: row["stream"]["latency"][key])
     for key in ("s2s_deg", "s2s_250_deg"):
         out[key] = most(lambda row, key=key: row["precision"]["nominal"][key])
@@ -151,7 +166,8 @@ def worst(rows):
         for key, table in (("valid", "ambient"), ("valid_250", "ambient_250")):
             out.setdefault(key, {})[name] = min(row[table][name]["valid"] for row in rows)
         out.setdefault("saturated_after", {})[name] = most(
-            lambda row, n=name: row["ambient"][n]["saturated_after"] + row["ambient_250"][n]["saturated_after"]
+            lambda row, n=name: row["ambient"][n]["saturated_after"]
+            + row["ambient_250"][n]["saturated_after"]
         )
     out["step"] = {
         key: most(lambda row, key=key: _larger(row["step"]["up"][key], row["step"]["down"][key]))

@@ -28,7 +28,12 @@ def size(elf=ELF):
             bss += length if kind == 8 else 0
     taken = text + data + SLOTS_BYTES + BOOTLOADER_BYTES
     return {
-        "flash": {"bytes": text + data, "taken": taken, "room": FLASH_BYTES, "spare": 1 - taken / FLASH_BYTES},
+        "flash": {
+            "bytes": text + data,
+            "taken": taken,
+            "room": FLASH_BYTES,
+            "spare": 1 - taken / FLASH_BYTES,
+        },
         "ram": {"bytes": data + bss, "room": RAM_BYTES},
     }
 
@@ -37,7 +42,7 @@ def sections(image):
     """[(name, type, flags, bytes)] of a 32-bit little-endian ELF."""
     if image[:6] != b"\x7fELF\x01\x01":
         raise SparsegazeError("the firmware is no 32-bit ELF", "run `make firmware`")
-    table, = struct.unpack_from("<I", image, 32)
+    (table,) = struct.unpack_from("<I", image, 32)
     width, count, names = struct.unpack_from("<HHH", image, 46)
     heads = [struct.unpack_from("<10I", image, table + k * width) for k in range(count)]
     base = heads[names][4]

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Static error of a reading over drawn parts: as it comes, and after self-calibration (frontend_methods.py)."""
+"""Static error of a reading over drawn parts: as it comes, and after self-calibration
+(frontend_methods.py)."""
 
 from functools import lru_cache
 from types import SimpleNamespace
@@ -14,7 +15,8 @@ EXPOSURE_STEPS = np.linspace(0.25, 1.0, 7)
 
 
 def draw(rng):
-    """One board's parts: junction and extra capacitance, offset, gain, INL, bandgap, comparator, leakage."""
+    """One board's parts: junction and extra capacitance, offset, gain, INL, bandgap, comparator,
+    leakage."""
     return SimpleNamespace(
         junction=1 + CAPACITANCE_PART * rng.standard_normal(),
         extra=1 + CAPACITANCE_PART * rng.standard_normal(),
@@ -36,7 +38,8 @@ def boards(seed, parts=PARTS):
 
 
 def error(method, adc_khz, exposure_us, photocurrent_na, ambient_na, seed):
-    """(raw, after): relative RMS over parts. after is nan where too few exposures of the range can be read."""
+    """(raw, after): relative RMS over parts. after is nan where too few exposures of the range can be
+    read."""
     found = [
         one_part(method, adc_khz, exposure_us, photocurrent_na, ambient_na, part) for part in boards(seed)
     ]
@@ -84,7 +87,8 @@ def one_part(method, adc_khz, exposure_us, photocurrent_na, ambient_na, part):
 
 
 def reading(method, adc_khz, nominal, real, charge_pc, part, rng):
-    """(codes, counted upwards from no charge; charges by the nominal law) of charges [n]; nan out of range."""
+    """(codes, counted upwards from no charge; charges by the nominal law) of charges [n]; nan out of
+    range."""
     cs = P.node.sample_hold_pf
     own = real.swing(charge_pc)
     held_v = np.zeros_like(own) if method.before == "ground" else rng.uniform(*NEIGHBOUR, own.shape) * own
