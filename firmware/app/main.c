@@ -17,6 +17,8 @@ enum {
     // What comes after the gaze takes about so much longer than the readings were on their way.
     AFTER_GAZE_US = 40,
     CATCH_UP_CYCLES = 8,
+    // Whatever happens, a request is heard after so many cycles.
+    PATIENCE_CYCLES = 64,
 };
 
 struct app_state app;
@@ -35,6 +37,8 @@ static uint8_t left;                    // cycles still to come
 static uint8_t under_way;
 static uint16_t last_us;                // of the last sample
 static uint8_t behind;                  // the last gaze was late
+static uint8_t refused;                 // a byte came and found no time
+static uint8_t waited;                  // cycles that it has waited
 static uint8_t skipped;                 // cycles without a look at exposures and health
 
 static uint16_t previous_exposure[HAL_CHANNELS];
@@ -90,7 +94,12 @@ static uint8_t time_for_more(void)
 
 uint8_t app_listens(void)
 {
-    return !asked.waiting && time_for_more();
+    if (asked.waiting)
+        return 0;
+    if (time_for_more() || waited > PATIENCE_CYCLES)
+        return 1;
+    refused = 1;
+    return 0;
 }
 
 void app_on_byte(uint8_t byte, uint32_t zero_us)
@@ -100,6 +109,7 @@ void app_on_byte(uint8_t byte, uint32_t zero_us)
     if (n < 0)
         return;
     app_request(&head, (uint8_t)n, zero_us);
+    waited = 0;
     app.fresh = 0;
     // Inference goes deepest: not from inside of a request.
     if (app.infer_fits)
@@ -243,6 +253,9 @@ void app_on_cycle(const struct hal_cycle *cycle)
     }
     app_live_cycle(cycle->t_us);
     last_us = (uint16_t)cycle->t_us + cycle->span_us;
+    if (refused && waited != UINT8_MAX)
+        waited++;
+    refused = 0;
     app.fresh = 1;
 }
 

@@ -221,7 +221,7 @@ def test_settings_exposures_limits_and_curves_survive_a_power_cycle(board):
 
 
 def test_lights_that_are_off_stay_off_through_a_power_cycle_and_every_frame_says_so(board):
-    nano, device = board(models={0: random_model(20).image})
+    nano, device = board()
     device.settings(lights=False)
     device.link.sleep(1.0)
     nano.control.power(False)
