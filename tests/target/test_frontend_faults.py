@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of LEDs, of the supply, and what gets in the way: detected, named in status, flagged in the stream, never a
-wild gaze that is called valid. The whole firmware, with a model of the simulated person who wears it.
+"""Faults of LEDs, of the supply, and what gets in the way: detected, named in status, flagged in the stream,
+never a wild gaze that is called valid. The whole firmware, with a model of the simulated person who wears it.
 """
 
 import shutil

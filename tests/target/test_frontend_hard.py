@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The front end's hard cases: light, exposure, time, and commands. The whole firmware in the virtual Nano, with
-a model of the simulated person who wears it: a gaze that is called valid is never wild.
+"""The front end's hard cases: light, exposure, time, commands. The whole firmware in the virtual Nano, with a
+model of the simulated person who wears it: a gaze that is called valid is never wild.
 """
 
 import shutil
@@ -120,9 +120,10 @@ def uneven_map(path, brighter=2, times=10.0):
     shape = np.exp(slope[:, 0] * azimuth[..., None] + slope[:, 1] * elevation[..., None])
     smooth = 1e-6 * shape[..., None] * gain[:, None] * gain
     lid = np.array([0.0, 1.0])
-    write_map(path, pupil_mm=[3.5], lid_opening=lid, slip_mm=([0], [0], [0]), elevation_deg=gaze, azimuth_deg=gaze,
-              smooth=np.broadcast_to(smooth, (1, 1, 1, 1, 2, *smooth.shape)), glint_lid_opening=lid,
-              glint_elevation_deg=[-25, 25], glint_azimuth_deg=[-25, 25], glint=np.zeros((1, 1, 1, 2, 2, 2, 6, 6)))
+    write_map(path, pupil_mm=[3.5], lid_opening=lid, slip_mm=([0], [0], [0]), elevation_deg=gaze,
+              azimuth_deg=gaze, smooth=np.broadcast_to(smooth, (1, 1, 1, 1, 2, *smooth.shape)),
+              glint_lid_opening=lid, glint_elevation_deg=[-25, 25], glint_azimuth_deg=[-25, 25],
+              glint=np.zeros((1, 1, 1, 2, 2, 2, 6, 6)))
     return str(path)
 
 
@@ -135,14 +136,13 @@ def test_one_led_ten_times_brighter_than_the_rest_has_its_own_exposure(worn, tmp
     lit = np.array([frame.counts.lit_code for frame in frames if frame.counts]).mean(axis=0)
     others = [k for k in range(6) if k != brighter]
     print(f"exposures {exposure}, codes {lit.round()}")
-    print({bit: int((flags(frames) & bit != 0).sum()) for bit in (lib.SG_FLAG_SATURATED, lib.SG_FLAG_STARVED)})
     assert not (flags(frames) & LIGHT).any()
     assert exposure[brighter] < 0.5 * exposure[others].max() and exposure[brighter] == exposure.min()
     assert lit.max() < 1000 and lit[brighter] > 200 and lit.min() > 20
 
 
 def test_a_step_of_a_thousand_in_the_middle_of_an_exposure(worn):
-    """12 steps up and 12 down at cycles that no exposure knows: few saturated frames, then the new level's error."""
+    """12 up, 12 down at cycles that no exposure knows: few saturated frames, then the new level's error."""
     one = worn()
     low, high, gap_us = 2.0, 2000.0, 100_000
     rng = np.random.default_rng(1)
@@ -163,19 +163,20 @@ def test_a_step_of_a_thousand_in_the_middle_of_an_exposure(worn):
         most = max(saturated[(since >= 0) & (since < gap_us - 5000)].sum() for since in after)
         soon = np.concatenate([error[(since >= 10_500) & (since < 25_000)] for since in after])
         later = np.concatenate([error[(since >= 50_000) & (since < 95_000)] for since in after])
-        print(f"{name}: at most {most} saturated; {np.nanmean(soon):.3f} deg after 10 frames ({np.isfinite(soon).mean():.2f}"
-              f" valid), {np.nanmean(later):.3f} after 50 ({np.isfinite(later).mean():.2f})")
+        shares = np.isfinite(soon).mean(), np.isfinite(later).mean()
+        means = [np.nanmean(part) if np.isfinite(part).any() else np.inf for part in (soon, later)]
+        print(f"{name}: at most {most} saturated; after 10 frames, after 50: {means} deg, valid {shares}")
         assert most <= 5
-        assert np.isfinite(soon).mean() > 0.9 * np.isfinite(later).mean() > 0.8
-        assert np.nanmean(soon) <= 1.2 * np.nanmean(later)
+        assert min(shares) > 0.8 and means[0] <= 1.2 * means[1]
 
 
-@pytest.mark.parametrize("rate_hz, hz, times", [(0, 100.0, 1.2), (0, 120.0, 1.2), (0, 100.1, 1.2), (500, 100.0, 1.5),
-                                                (250, 120.0, 1.5), (100, 101.0, 2.0), (60, 120.5, 2.0)])
-def test_flicker_and_its_beat_with_the_frame_rate(worn, rate_hz, hz, times):
-    """50 % deep, of the signal's size, against the same light that does not flicker; rate 0: the full rate."""
+@pytest.mark.parametrize("rate_hz, repeats, hz, times", [
+    (0, 1, 100.0, 1.2), (0, 1, 120.0, 1.2), (0, 1, 100.1, 1.2), (500, 1, 100.0, 1.5), (250, 1, 120.0, 1.5),
+    (250, 4, 120.0, 1.5), (100, 1, 101.0, 1.5), (100, 4, 100.3, 1.5), (60, 1, 120.5, 1.5)])
+def test_flicker_and_its_beat_with_the_frame_rate(worn, rate_hz, repeats, hz, times):
+    """50 % deep, of the signal's size, against the same light that does not flicker; rate 0: the full one."""
     one = worn()
-    one.device.settings(rate_hz=rate_hz)
+    one.device.settings(rate_hz=rate_hz, repeats=repeats)
     one.control.ambient(200.0)
     one.settle(0.6)
     seconds = 0.4 if rate_hz == 0 else 1.5
@@ -185,9 +186,10 @@ def test_flicker_and_its_beat_with_the_frame_rate(worn, rate_hz, hz, times):
     frames = one.run(seconds)
     one.never_wild(frames, "flicker")
     found = one.error(frames)
-    print(f"{rate_hz or 'full'} Hz, {hz} Hz: {np.nanmean(found):.3f} deg, steady {steady:.3f}")
     assert not (flags(frames) & lib.SG_FLAG_SATURATED).any()
-    assert np.isfinite(found).mean() > 0.95 and np.nanmean(found) <= times * steady
+    assert np.isfinite(found).mean() > 0.95
+    print(f"{rate_hz or 'full'} Hz, {hz} Hz: {np.nanmean(found):.3f} deg, steady {steady:.3f}")
+    assert np.nanmean(found) <= times * steady
 
 
 # -- exposure ------------------------------------------------------------------------------------------------
@@ -245,7 +247,7 @@ def test_an_exposure_change_alone_moves_the_gaze_by_less_than_its_noise(worn, sh
 
 
 def test_device_time_is_even_through_hundreds_of_timer_wraps(worn):
-    """Timer1's 16 bits wrap every 4096 us, the byte that counts its wraps at 1.05 s: 2.2 s of frames, all alike."""
+    """Timer1's 16 bits wrap every 4096 us, the byte that counts its wraps after 1.05 s: 2.2 s of frames."""
     one = worn()
     one.settle(0.2)
     t = np.array([frame.t_us for frame in one.run(2.2)])
@@ -255,25 +257,24 @@ def test_device_time_is_even_through_hundreds_of_timer_wraps(worn):
 
 
 def test_the_sequence_wraps_without_a_gap_and_the_clock_goes_on(worn):
-    """65536 frames at full rate, two thirds of a minute of them unheard; 16,000 wraps of Timer1 lie behind then.
-    (Device time itself wraps after 71 minutes, its upper half every 268 s: too long for a test.)
+    """65536 frames at full rate, most of them unheard; 16,000 wraps of Timer1 lie behind then. (Device time
+    itself wraps after 71 minutes, too long for a test: the host's part in that is tested with the stream.)
     """
     one = worn()
-    one.device.link.sleep(0.2)
-    one.device.set_stream(gaze=True)
-    begun = next(one.device.frames(2.0)).seq
+    first = one.run(0.1)[-1]
     one.device.set_stream()
-    one.device.link.sleep((65536 - begun - 400) * 1e-6 * one.device.settings().frame_period_us)
+    period_us = one.device.settings().frame_period_us
+    one.device.link.sleep((65536 - first.seq - 700) * 1e-6 * period_us)
     before = one.device.status()
     frames = one.run(1.0)
     seq = np.array([frame.seq for frame in frames]) & 0xFFFF
-    steps = np.diff(np.array([frame.t_us for frame in frames]))
+    steps = np.diff([frame.t_us for frame in frames])
     print(f"numbers {seq[0]} .. {seq[-1]}, steps {steps.min()} .. {steps.max()} us")
-    assert seq[0] > 60_000 and seq[-1] < 5000
+    assert first.seq < 2000 and seq[0] > 60_000 and seq[-1] < 5000
     assert (np.diff(seq) % 65536 == 1).all() and np.ptp(steps) <= 1
+    passed = frames[-1].t_us - first.t_us
+    assert abs(passed - period_us * (65536 + int(seq[-1]) - first.seq)) <= 2
     nothing_lost(before, one.device.status(), frames)
-    pong, now = one.device.ping(), one.now_us()
-    assert -1000 < now + one.offset_us - pong.tx_us < 2000
     one.good(frames, "over the wrap", 0.995)
 
 
@@ -299,7 +300,7 @@ def test_a_clock_off_by_one_per_cent_changes_nothing_in_device_time(worn, seed):
 
 
 def test_a_command_storm_at_full_frame_rate_loses_and_delays_nothing(worn):
-    """The next request as soon as the last is answered, long ones and short ones, while every gaze is sent."""
+    """The next request as soon as the last is answered, long ones and short, while every gaze is sent."""
     one = worn()
     one.settle()
     one.device.set_stream(gaze=True)
@@ -340,7 +341,8 @@ def test_a_flood_that_nobody_could_answer_is_survived_with_lights_within_the_cap
     began, link = one.control.time().cycle, one.device.link
     one.device.set_stream(gaze=True)
     for k in range(100):
-        link.write(wire.encode(lib.SG_MSG_STATUS, k) * 8 + rng.integers(0, 256, 120, np.uint8).tobytes() + b"\0")
+        rubbish = rng.integers(0, 256, 120, np.uint8).tobytes() + b"\0"
+        link.write(wire.encode(lib.SG_MSG_STATUS, k) * 8 + rubbish)
         link.read(4096, 0.002)
     counted, cycles = one.control.counters(), one.control.time().cycle - began
     link.sleep(0.05)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the readings are worth: noise, exposures, neighbours, and light that is not ours. Raw frames, no model."""
+"""What the readings are worth: noise, exposures, neighbours, light that is not ours. Raw frames, no model."""
 
 import numpy as np
 import pytest
@@ -43,9 +43,9 @@ def flags_of(frames):
 def expected_noise(lit_code, exposure_us):
     """RMS of a feature in the dark, in its steps, by the constants alone; [6] of mean lit codes, exposures.
 
-    The converter's 0.7 LSB grow by a sixteenth of 1.25 at 250 kHz, rounding adds 1/12, the rail's 0.2 mV are 0.19
-    of a code. Of a second's code SHARED of its first's is subtracted, with that one's noise. The lights follow 5 mV
-    of ripple on their 2 V, drawn anew every 10 us; the reference has 0.2 mV of 1.1 V.
+    The converter's 0.7 LSB grow by a sixteenth of 1.25 at 250 kHz, rounding adds 1/12, the rail's 0.2 mV are
+    0.19 of a code. Of a second's code SHARED of its first's is subtracted, with that one's noise. The lights
+    follow 5 mV of ripple on their 2 V, drawn anew every 10 us; the reference has 0.2 mV of 1.1 V.
     """
     first, second = np.array(PAIRS).T
     signal, codes = lit_code.copy(), np.full(6, (0.7 * (1 + 1.25 / 16)) ** 2 + 1 / 12 + 0.19 ** 2)
@@ -66,7 +66,7 @@ def test_noise_of_the_features_is_what_physics_leaves(board, light):
     expected, found = expected_noise(lit, exposure), jitter(features(frames))
     print(f"{light}: RMS {np.round(found, 1)}, expected {np.round(expected, 1)} of 1/4096 octave,"
           f" codes {lit.round()}, {exposure.round()} us")
-    assert (found <= 1.25 * expected).all() and (found >= 0.75 * expected).all()
+    assert (found <= 1.2 * expected).all() and (found >= 0.8 * expected).all()
 
 
 @pytest.mark.parametrize("repeats", [4, 16])
@@ -82,7 +82,7 @@ def test_cycles_of_a_frame_average_their_noise(board, repeats):
 
 
 def test_an_exposure_change_alone_moves_no_feature_by_more_than_its_noise(board):
-    """After the self-calibration of linearity: capacitance, the converter's zero, gain, late releases are gone."""
+    """After the self-calibration of linearity: capacitance, the converter's zero, late releases are gone."""
     nano, device = board()
     still(nano, device)
     done = linearity.run(device)
@@ -101,7 +101,8 @@ def test_an_exposure_change_alone_moves_no_feature_by_more_than_its_noise(board)
         assert not (flags_of(frames) & LIGHT).any()
         off = features(frames).mean(axis=0) - reference
         allowed = noise if share >= 0.5 else jitter(features(frames))
-        print(f"{share:.2f} of {np.round(chosen, 1)} us: moved {np.round(off, 1)}, noise {np.round(allowed, 1)}")
+        print(f"{share:.2f} of {np.round(chosen, 1)} us: moved {np.round(off, 1)},"
+              f" noise {np.round(allowed, 1)}")
         late.append((np.abs(off) / allowed).max())
     assert max(late) <= 1.0
 
@@ -190,7 +191,8 @@ def test_a_step_of_ambient_leaves_the_features_where_they_were_within_ten_frames
     offset_us = device.clock.unwrap(ping.tx_us) - nano.control.time().us
     moments = [began_us + 30_000 + gap_us * k + int(rng.integers(0, 1000)) for k in range(20)]
     for k, moment in enumerate(moments):
-        nano.control.set_at(moment * CYCLES_PER_US + int(rng.integers(0, 16)), "ambient_na", (2000.0, 2.0)[k % 2])
+        cycle = moment * CYCLES_PER_US + int(rng.integers(0, 16))
+        nano.control.set_at(cycle, "ambient_na", (2000.0, 2.0)[k % 2])
     frames = frames_of(device, 1650)
     times, found = np.array([frame.t_us for frame in frames]) - offset_us, features(frames)
     saturated = flags_of(frames) & lib.SG_FLAG_SATURATED != 0
@@ -198,10 +200,11 @@ def test_a_step_of_ambient_leaves_the_features_where_they_were_within_ten_frames
         since = times[:, None] - np.array(steps)
         soon = found[((since >= 10_500) & (since < 20_000)).any(axis=1)]
         later = found[((since >= 40_000) & (since < 75_000)).any(axis=1)]
-        most = max(saturated[(since[:, k] >= 0) & (since[:, k] < gap_us - 2000)].sum() for k in range(len(steps)))
+        within = (since >= 0) & (since < gap_us - 2000)
+        most = (saturated[:, None] & within).sum(axis=0).max()
         level, spread = later.mean(axis=0), later.std(axis=0)
         rms = np.sqrt(((soon - level) ** 2).mean(axis=0))
-        print(f"{name}: at most {most} saturated frames; after 10 frames RMS {np.round(rms)} about the new level,"
+        print(f"{name}: at most {most} saturated frames; RMS about the new level {np.round(rms)} after 10,"
               f" later {np.round(spread)}")
         assert most <= 5 and len(soon) > 50 and len(later) > 200
         assert np.sqrt((rms ** 2).mean()) <= 1.25 * np.sqrt((spread ** 2).mean())

@@ -10,7 +10,7 @@ from sparsegaze.virtual import VirtualNano
 from sparsegaze.wire import lib
 
 PERSON = 1              # of headsets/led2gaze.toml: its response map is computed once and kept
-TARGETS, VECTORS = 50, 24
+TARGETS, VECTORS = 50, 18
 CYCLES_PER_US = 16
 WILD_DEG = 5.0          # off the truth while called valid: no error of a calibration reaches that
 GOOD_DEG = 1.5          # mean, of a calibration on so few targets
@@ -21,7 +21,7 @@ PLACES = ((0.0, 0.0), (9.0, -6.0))
 
 
 def calibrated(folder, elf):
-    """A state folder (flash, EEPROM) of the firmware `elf` with a model of PERSON; tried once below `folder`."""
+    """A state folder (flash, EEPROM) of the firmware `elf` with a model of PERSON; tried once a `folder`."""
     done, state = folder / "worn", folder / "worn-part"
     if not done.is_dir():
         assert not state.exists(), "the calibration failed before: see the first test that needed it"
@@ -37,7 +37,7 @@ def calibrated(folder, elf):
 
 
 class Worn:
-    """A VirtualNano and the Device on it, in lockstep; the eye is where it is told to be, at once, and still."""
+    """A VirtualNano and the Device on it, in lockstep; the eye is where it is told to be, and still."""
 
     def __init__(self, nano, device):
         self.nano, self.device, self.control = nano, device, nano.control
