@@ -139,6 +139,16 @@ def test_latency_is_read_off_the_log_of_pins_and_bytes(bench, tmp_path):
     assert found["latency_mean_max_ms"] == pytest.approx((span + 9_016) / 16_000)
 
 
+@pytest.mark.parametrize("cut", range(0, 60, 7))
+def test_a_log_that_begins_within_a_cycle_is_read_from_the_next_one_on(bench, cut):
+    rows = [row for k in range(4) for row in cycle_log(20_000 + 16_000 * k)[0]]
+    rows.sort(key=lambda row: row[1])
+    whole_mean, whole_last, _ = bench.latency.cycles_of(rows)
+    mean, last, _ = bench.latency.cycles_of(rows[cut:])
+    assert len(whole_mean) == 4 and 2 <= len(mean) <= 4
+    assert mean == pytest.approx(whole_mean[-len(mean) :]) and last == pytest.approx(whole_last[-len(last) :])
+
+
 def good_report():
     """A report that meets every bar of the device."""
     names = ("room", "bright_room", "sun_gap")

@@ -16,6 +16,7 @@ from sparsegaze.errors import SparsegazeError
 CYCLES_PER_MS = 16_000.0
 FLOATING = 3
 CHANNELS, SAMPLES = 6, 12
+FIRST = 5  # sensor of the first lit sample of a cycle
 
 
 def read(path):
@@ -27,8 +28,9 @@ def read(path):
 def cycles_of(rows):
     """(mean [n], last [n], sent [m]): mean sample time and last sample of every sensing cycle, ends of
     packets."""
-    lit, released, middles, samples, sent = 0, {}, [], [], []
-    mean, last, before = [], [], None
+    lit, released, sent = 0, {}, []
+    mean, last = [], []
+    middles = samples = None  # of the cycle under way; None until a first one begins
     for event, cycle in rows:
         kind, _, value = event.partition(":")
         if kind == "lit":
@@ -40,16 +42,17 @@ def cycles_of(rows):
             sent.append(cycle)
         elif kind == "adc" and int(value) < CHANNELS:
             channel = int(value)
-            if lit and before is not None and not before[1] and len(middles) == CHANNELS:
-                middles, samples = [], []  # the first pair again
-            before = (channel, lit)
-            samples.append(cycle)
-            if lit and channel in released:
+            if lit and channel == FIRST:
+                middles, samples = [], 0
+            if middles is None or channel not in released:
+                continue
+            samples += 1
+            if lit:
                 middles.append((released[channel] + cycle) / 2)
-            if len(middles) == CHANNELS and len(samples) >= SAMPLES:
+            if samples == SAMPLES and len(middles) == CHANNELS:
                 mean.append(np.mean(middles))
                 last.append(cycle)
-                middles, samples = [], []
+                middles = None
     return np.array(mean), np.array(last), np.array(sent)
 
 
