@@ -37,6 +37,8 @@ void hal_start(struct hal_timing *timing, uint16_t exposure_cycles[HAL_CHANNELS]
 
 static void sleep_if_idle(void)
 {
+    if (!sense_idle())
+        return;
     cli();
     if (sense_idle() && serial_idle()) {
         SMCR = 1 << SE;         // idle: timers, converter and serial line go on
