@@ -180,7 +180,7 @@ def test_no_request_writes_to_flash(board):
 
 def test_answers_survive_a_flood_and_dropped_frames_are_counted(board):
     """The line is full of answers: stream frames give way whole, and every gap is in the counter."""
-    _, device = board(models={0: random_model(64).image})
+    _, device = board()
     device.set_baud(500_000)
     device.set_stream(raw=True, gaze=True, counts=True)
     link, decoder = device.link, wire.Decoder()
@@ -206,8 +206,8 @@ def test_answers_survive_a_flood_and_dropped_frames_are_counted(board):
     missing = 3 * sensed - len(streamed)
     status = device.status()
     assert status.tx_dropped > 0 and status.rx_overrun == 0
-    # Frames at both ends of the observation may be counted and not seen.
-    assert 0 <= status.tx_dropped - missing <= 3 * 30
+    # Frames at both ends of the observation may be counted and not seen; frames never taken up are counted as late.
+    assert -3 * status.late_frames <= status.tx_dropped - missing <= 3 * 30
 
 
 def test_a_second_verification_at_once_is_refused_busy_and_the_first_answered(board):
