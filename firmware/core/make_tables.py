@@ -1,6 +1,7 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Write the constant tables of the core: sg_gp_table.c, sg_mlp_table.c, sg_light_table.[ch], sg_crc32_table.h.
+"""Write the constant tables of the core: sg_gp_table.c, sg_mlp_table.c, sg_light_table.[ch],
+sg_crc32_table.h.
 
     python3 firmware/core/make_tables.py            write them beside this script
     python3 firmware/core/make_tables.py --check    exit 1 if a committed file differs
@@ -23,13 +24,14 @@ UNIT_A = 62.5e-12         # feature 0
 FEATURE_PER_OCTAVE = 4096
 CODE_UNIT = 32            # charges and codes are counted in 1/32 of a code
 
-# Ambient light: weights near those exact at this frequency, least wrong at 100 and 120 Hz. An unlit sample comes 3 of 18 slots after
-# the lit one.
+# Ambient light: weights near those exact at this frequency, least wrong at 100 and 120 Hz. An unlit sample
+# comes 3 of 18 slots after the lit one.
 FLICKER_HZ = 110.0
 LIT_BEFORE_UNLIT = 3.0 / 18.0
 PERIOD_FROM, PERIOD_STEP, PERIOD_NODES = 15984, 2048, 9
 
-# Of one code, rms, at an ADC clock of 250 kHz. Means of less than 40/32 are raised by codes that cannot be negative.
+# Of one code, rms, at an ADC clock of 250 kHz. Means of less than 40/32 are raised by codes that cannot be
+# negative.
 NOISE_LSB = 0.755
 CLIPPED_NODES, CLIPPED_OFFSET = 40, 128
 
@@ -136,7 +138,8 @@ def flicker_left(before_q8, earlier_q8, period_cycles, hz):
 def flicker_weights_q8(period_cycles):
     """(b, -c) in 1/256 beside those exact at 110 Hz that leave least of 100 and 120 Hz, the worse of both."""
     before, earlier = flicker_weights(period_cycles)
-    near = [(rounded(256 * before) + i, rounded(-256 * earlier) + j) for i in range(-2, 3) for j in range(-2, 3)]
+    near = [(rounded(256 * before) + i, rounded(-256 * earlier) + j)
+            for i in range(-2, 3) for j in range(-2, 3)]
     return min(near, key=lambda pair: max(flicker_left(*pair, period_cycles, hz) for hz in (100.0, 120.0)))
 
 
@@ -165,25 +168,27 @@ def light_table():
 
 
 def rectified(level, noise):
-    """Mean code of a level, in codes, under noise (rms) when nothing below 0 is read: sum over the codes' thresholds."""
+    """Mean code of a level, in codes, under noise (rms) when nothing below 0 is read: sum over thresholds."""
     return sum(0.5 * math.erfc((code - 0.5 - level) / noise / math.sqrt(2)) for code in range(1, 12))
 
 
 def unclipped():
-    """[level, 1/32 code] below a mean code of i / 32, i = 0..39, of the converter's noise; a mean of 0 is 0.1 / 32."""
+    """[level, 1/32 code] behind a mean code of i / 32, i = 0..39; a mean of 0 is taken as 0.1 / 32."""
     levels = []
     for i in range(CLIPPED_NODES):
         low, high = -4.0, 4.0
         for _ in range(50):
             middle = (low + high) / 2
-            low, high = (middle, high) if rectified(middle, NOISE_LSB) < max(i, 0.1) / CODE_UNIT else (low, middle)
+            below = rectified(middle, NOISE_LSB) < max(i, 0.1) / CODE_UNIT
+            low, high = (middle, high) if below else (low, middle)
         levels.append(rounded(low * CODE_UNIT))
     return levels
 
 
 def log2_table():
     """Text of sg_light_table.c. The last entry is one less, so that no logarithm reaches the next octave."""
-    mantissa = [rounded(FEATURE_PER_OCTAVE * math.log2(1 + i / 64)) for i in range(64)] + [FEATURE_PER_OCTAVE - 1]
+    mantissa = [rounded(FEATURE_PER_OCTAVE * math.log2(1 + i / 64)) for i in range(64)]
+    mantissa.append(FEATURE_PER_OCTAVE - 1)
     return (LICENSE + MADE_BY + '#include "sg_light_loop.h"\n#include "sg_rom.h"\n\n'
             "const uint16_t sg_light_log2_table[65] SG_ROM = {\n" + rows(mantissa) + "};\n\n"
             "const uint8_t sg_light_clipped_table[SG_LIGHT_CLIPPED_Q5] SG_ROM = {\n"

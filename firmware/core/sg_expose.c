@@ -30,7 +30,8 @@ uint16_t sg_expose_from_us_q4(uint16_t exposure_us_q4)
     return clipped(exposure_us_q4, SG_EXPOSE_MAX_CYCLES);
 }
 
-void sg_expose_start(struct sg_expose *expose, const uint16_t exposure_cycles[6], const uint16_t most_cycles[6])
+void sg_expose_start(struct sg_expose *expose, const uint16_t exposure_cycles[6],
+                     const uint16_t most_cycles[6])
 {
     *expose = (struct sg_expose) { .acquiring = 1 };
     for (uint8_t i = 0; i < CHANNELS; i++) {
@@ -77,7 +78,8 @@ static uint16_t stretch_q6(uint16_t load)
 // Exposure that would have met the goal with this much unlit and this much of ours.
 static uint16_t wanted(const struct sg_expose_led *led, uint16_t unlit, uint16_t signal)
 {
-    const uint32_t cycles = ((uint32_t)led->exposure_cycles * stretch_q6((uint16_t)(unlit + 2U * signal))) >> 6;
+    const uint16_t stretch = stretch_q6((uint16_t)(unlit + 2U * signal));
+    const uint32_t cycles = ((uint32_t)led->exposure_cycles * stretch) >> 6;
     const uint16_t whole = cycles > UINT16_MAX >> 3 ? UINT16_MAX >> 3 : (uint16_t)cycles;
     return within(led, (uint16_t)(whole - ((uint16_t)(whole * led->caution) >> 3)));
 }
@@ -169,8 +171,8 @@ static uint8_t look(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
     return choose(led, signal_q2);
 }
 
-// Has the light around fallen away? Looks in consecutive cycles, each at another sensor, say so. Then all exposures
-// are too short, and wait for no patience.
+// Has the light around fallen away? Looks in consecutive cycles, each at another sensor, say so. Then all
+// exposures are too short, and wait for no patience.
 static void watch_ambient(struct sg_expose *expose, const struct sg_expose_led *led, uint16_t unlit)
 {
     if (led->unlit_peak < FALL_LEAST_Q2 || unlit >> 2 >= led->unlit_peak >> 4) {

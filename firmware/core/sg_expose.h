@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // Automatic exposure of the six sensors, from their codes alone.
 //
-// The goal: unlit + 2 * (lit - unlit) = 0.9 of full scale. Gaze alone moves our light by a factor of 1.9 either way
-// at most, so wherever it was when an exposure was chosen, looking around neither saturates nor changes it. What
-// ambient light adds is seen in the unlit code, so a change of it is acted on at once; our own light changing must
-// last. Where the goal needs more than the longest exposure, that is taken: the usual state in the dark.
+// The goal: unlit + 2 * (lit - unlit) = 0.9 of full scale. Gaze alone moves our light by a factor of 1.9
+// either way at most, so wherever it was when an exposure was chosen, looking around neither saturates nor
+// changes it. What ambient light adds is seen in the unlit code, so a change of it is acted on at once; our
+// own light changing must last. Where the goal needs more than the longest exposure, that is taken: the usual
+// state in the dark.
 #ifndef SG_EXPOSE_H
 #define SG_EXPOSE_H
 
@@ -37,7 +38,7 @@ struct sg_expose_led {
     uint8_t signal_then;        // lit less unlit code, / 4, when it was
     uint8_t stage;              // enum sg_expose_stage
     int8_t streak;              // looks in a row that were too bright (> 0) or too dim (< 0)
-    uint8_t caution;            // eighths taken off the goal since exposures chosen of late were full soon after
+    uint8_t caution;            // eighths taken off the goal: exposures were full soon after the choice
     uint8_t age;                // looks since the exposure changed, up to 255
     uint8_t least_q4;           // the port takes no less than this, / 16 cycles, as far as is known
 };
@@ -53,25 +54,26 @@ enum sg_expose_stage {
 struct sg_expose {
     struct sg_expose_led led[6];
     uint8_t acquiring;          // 1: some may be
-    uint8_t fallen;             // looks in a row that found an unlit code of less than a sixteenth of its peak
+    uint8_t fallen;             // looks in a row that found an unlit code below 1/16 of its peak
     uint8_t next;               // channel to look at
     uint8_t rounds;             // of looks, for what is slow
 };
 
 // Begin at these exposures (clipped), with these limits. To hold exposures, start them there and call only
 // sg_expose_taken.
-void sg_expose_start(struct sg_expose *expose, const uint16_t exposure_cycles[6], const uint16_t most_cycles[6]);
+void sg_expose_start(struct sg_expose *expose, const uint16_t exposure_cycles[6],
+                     const uint16_t most_cycles[6]);
 
-// What the port made of the exposures asked for: it may move them by a few per cent, and refuse short ones (what is
-// taken instead is then the least). Call after every change.
+// What the port made of the exposures asked for: it may move them by a few per cent, and refuse short ones
+// (what is taken instead is then the least). Call after every change.
 void sg_expose_taken(struct sg_expose *expose, const uint16_t exposure_cycles[6]);
 
-// One cycle: a look at the next channel; at once at those that are full (an eighth of the exposure, a sixteenth if
-// the unlit code is full too); at those that are being acquired, two a cycle: after the start, after being full, and
-// when ambient light fell away.
+// One cycle: a look at the next channel; at once at those that are full (an eighth of the exposure, a
+// sixteenth if the unlit code is full too); at those that are being acquired, two a cycle: after the start,
+// after being full, and when ambient light fell away.
 //
-//   lit_code, unlit_code, exposure_cycles   as in struct sg_reading. A cycle taken with another exposure than the one in
-//                      force says nothing but "saturated"; a pipeline of any depth does not correct twice.
+//   lit_code, unlit_code, exposure_cycles   as in struct sg_reading. A cycle taken with another exposure than
+//                      the one in force says nothing but "saturated"; a pipeline of any depth does not correct twice.
 // Returns 1 if any led[].exposure_cycles changed, else 0.
 uint8_t sg_expose_cycle(struct sg_expose *expose, const uint16_t lit_code[6], const uint16_t unlit_code[6],
                         const uint16_t exposure_cycles[6]);

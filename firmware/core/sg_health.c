@@ -6,8 +6,8 @@ enum {
     OCTAVE = 4096,
     NEAR = OCTAVE >> 1,
     RANGE_STEPS = 4096,         // of the calibrated range
-    // A node without an LED has the pin's 6 pF and takes 14 of 20 parts of what the sample capacitor held: 7/10 of
-    // the code before. It follows that code even as it moves, which no LED does.
+    // A node without an LED has the pin's 6 pF and takes 14 of 20 parts of what the sample capacitor held:
+    // 7/10 of the code before. It follows that code even as it moves, which no LED does.
     MIRROR_NUMERATOR = 7, MIRROR_DENOMINATOR = 10,
     MIRROR_LEAST = 64,          // codes before, below which 7/10 prove nothing
     MIRROR_SLACK = 40,          // tenths of a code
@@ -18,8 +18,8 @@ void sg_health_start(struct sg_health *health)
     *health = (struct sg_health) { .fault = { 0 } };
 }
 
-// Count a suspicion up, its absence down. Returns the fault to report: `suspected` once it has lasted, `known` until
-// it has been gone as long.
+// Count a suspicion up, its absence down. Returns the fault to report: `suspected` once it has lasted,
+// `known` until it has been gone as long.
 static uint8_t debounced(uint8_t *count, uint8_t suspected, uint8_t known)
 {
     if (suspected) {
@@ -37,7 +37,8 @@ static uint8_t mirrors(struct sg_health *health, uint8_t i, const struct sg_heal
 {
     if (sight->before_code < MIRROR_LEAST)
         return 0;
-    const int16_t off = (int16_t)(MIRROR_DENOMINATOR * sight->lit_code - MIRROR_NUMERATOR * sight->before_code);
+    const int16_t off = (int16_t)(MIRROR_DENOMINATOR * sight->lit_code
+                                  - MIRROR_NUMERATOR * sight->before_code);
     if (off > MIRROR_SLACK || off < -MIRROR_SLACK) {
         health->least[i] = health->most[i] = 0;
         return 0;

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Is a channel at fault? From its codes, its exposure, and the range that the model was calibrated in.
 //
-// Faults must last PATIENCE looks, and must be gone as long to be forgotten. One channel every eighth cycle is enough.
+// Faults must last PATIENCE looks, and must be gone as long to be forgotten. One channel every eighth cycle
+// is enough.
 #ifndef SG_HEALTH_H
 #define SG_HEALTH_H
 
@@ -30,7 +31,7 @@ struct sg_health_sight {
     uint16_t exposure_cycles;
     uint16_t most_cycles;       // the longest that the timing allows
     uint16_t feature;
-    uint16_t offset;            // of the model (struct sg_model_head): the calibrated range is 0 <= x - offset and
+    uint16_t offset;            // of the model (struct sg_model_head); its range is 0 <= x - offset and
     uint16_t gain_q12;          // ((x - offset) * gain_q12) >> 12 <= 4095. Gain 0: no model, or not in it
 };
 
@@ -38,7 +39,7 @@ struct sg_health {
     uint8_t fault[6];           // bits of enum sg_health_fault
     uint8_t dark[6];            // looks in a row (up and down) that spoke for OPEN or SHORT
     uint8_t far[6];             // for LOW or HIGH
-    uint8_t least[6];           // lit codes / 4 since a suspicion of OPEN that mirrors the neighbour: they must move
+    uint8_t least[6];           // lit codes / 4 of the neighbour that the channel seems to mirror
     uint8_t most[6];
 };
 

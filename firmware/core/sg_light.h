@@ -1,18 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
 // Photocurrents of one sensing cycle: ADC codes, lit and unlit, to six features.
 //
-// A node is held at 0 V, let go for an exposure, and sampled against the 1.1 V reference. The same again without
-// our light. What was collected more is ours: charge of the lit code minus charge of the unlit one, over the
-// exposure, on a logarithmic scale. Ambient light is interpolated to the moment of the lit sample, or averaged
-// while it rests.
+// A node is held at 0 V, let go for an exposure, and sampled against the 1.1 V reference. The same again
+// without our light. What was collected more is ours: charge of the lit code minus charge of the unlit one,
+// over the exposure, on a logarithmic scale. Ambient light is interpolated to the moment of the lit sample,
+// or averaged while it rests.
 //
-// Charge on a node at V, its junction reverse-biased by the rail less V, its sample capacitor come from V_before:
+// Charge on a node at V, its junction reverse-biased by the rail less V, its sample capacitor come from
+// V_before:
 //   Q = F(1.8) - F(1.8 - V) + (6 + 14) pF * V - 14 pF * V_before,  F(r) = 40 pF * 0.7/0.6 * (1 + r/0.7)^0.6
 // In units of a code at 0 V, with x = code / 1024 (make_tables.py fits k1 and k2):
-//   q(code) = code * (1 + (k1 + curve / 1024) * x + k2 * x^2),   signal = q(lit) - q(unlit) - s * (before, the same)
-// The unlit code meant is that of the lit moment, u, three sixths of a phase (18 slots a cycle, 3 of them) before
-// the unlit sample. Exact for light that rests and, but for the rounding of b and c, for 110 Hz; of
-// 100 and 120 Hz 0.3 % of the amplitude is left at 999 us, 2.2 % at 2 ms. With this and the two previous unlit codes:
+//   q(code) = code * (1 + (k1 + curve / 1024) * x + k2 * x^2)
+//   signal = q(lit) - q(unlit) - s * (lit - unlit, both of the channel sampled before)
+// The unlit code meant is that of the lit moment, u, three sixths of a phase (18 slots a cycle, 3 of them)
+// before the unlit sample. Exact for light that rests and, but for the rounding of b and c, for 110 Hz; of
+// 100 and 120 Hz 0.3 % of the amplitude is left at 999 us, 2.2 % at 2 ms. With this and the two previous
+// unlit codes:
 //   u = u0 + b (u1 - u0) + c (u2 - u0),  th = 2 pi 110 Hz * period, ph = th / 6,
 //   b = sin(ph/2) sin(th - ph/2) / sin(th/2)^2,   c = -sin(ph/2) sin((th - ph)/2) / (sin(th) sin(th/2))
 #ifndef SG_LIGHT_H
@@ -29,8 +32,8 @@ enum sg_light_limits {
     SG_LIGHT_REPEATS_MAX = 16,
 };
 
-// Bits returned by sg_light_features; the values are those of enum sg_flag (sg_wire.h), which this module does not
-// include.
+// Bits returned by sg_light_features; the values are those of enum sg_flag (sg_wire.h), which this module
+// does not include.
 enum sg_light_flag { SG_LIGHT_SATURATED = 8, SG_LIGHT_STARVED = 16 };
 
 // What the port saw in one sensing cycle.
@@ -40,19 +43,19 @@ struct sg_reading {
     uint16_t exposure_cycles[6];    // release to sample as planned, the same lit and unlit
     uint8_t late_lit_cycles[6];     // how much shorter than planned it was, 255 = that or more
     uint8_t late_unlit_cycles[6];
-    uint16_t held_code;             // what the sample capacitor held before the cycle's first lit sample, mostly 0
+    uint16_t held_code;             // what the sample capacitor held before the first lit sample, mostly 0
 };
 
 struct sg_light_channel {
     int32_t sum_q5;                 // signal of the cycles added, 1/32 code at 0 V
     uint16_t exposure_cycles;       // that of everything here
     int16_t unit_q12;               // feature of 1/32 code in this exposure
-    uint16_t unlit_q5[2];           // of the previous cycle and of the one before it, while ambient light moves
+    uint16_t unlit_q5[2];           // of the previous cycle and the one before it, while light moves
     uint16_t mean_q5;               // of unlit codes
     int16_t slope_q16;              // 2 k1 and the channel's curve
-    uint8_t settled;                // cycles with this exposure, up to 16: until then the mean follows by a quarter
+    uint8_t settled;                // cycles with this exposure, up to 16; before, the mean follows fast
     uint8_t cycles;                 // added since the last features
-    uint8_t flags;                  // bits of enum sg_light_flag: of the cycles added; after sg_light_features its own
+    uint8_t flags;                  // bits of enum sg_light_flag, of the cycles added
     uint8_t reserved;
 };
 
@@ -73,19 +76,19 @@ struct sg_light {
 void sg_light_start(struct sg_light *light, uint8_t wiring, uint16_t period_cycles);
 
 // By self-calibration. In force from the next cycle on.
-//   curve_q10  curvature, 1/1024, on top of the nominal junction's: charge = code * (1 + ... + curve * code / 1024)
-//   zero_q2    code that the converter would read at 0 V if codes could be negative, 1/4 code, -128..0: how far down
-//              the mean of unlit codes that are clipped at 0 may be thought to be
+//   curve_q10  curvature, 1/1024, on top of the nominal junction's k1
+//   zero_q2    code that the converter would read at 0 V if codes could be negative, 1/4 code, -128..0: how
+//              far down the mean of unlit codes that are clipped at 0 may be thought to be
 void sg_light_curve(struct sg_light *light, const int8_t curve_q10[6], int8_t zero_q2);
 
-// A gap in the cycles (a pause between frames, a lost cycle): unlit codes of before are no longer neighbours in
-// time. What rests is kept; what moves begins anew.
+// A gap in the cycles (a pause between frames, a lost cycle): unlit codes of before are no longer neighbours
+// in time. What rests is kept; what moves begins anew.
 void sg_light_gap(struct sg_light *light);
 
 // One cycle: added to the frame. Exposures may differ from those of the cycle before (what was known of the
 // channel's ambient light then begins anew).
-// Accuracy   of the charge: see tests/unit/test_core_light.py. A late release is made up for exactly, as long as
-//            the light rests; a channel later than half its exposure is STARVED.
+// Accuracy   of the charge: see tests/unit/test_core_light.py. A late release is made up for exactly, as long
+//            as the light rests; a channel later than half its exposure is STARVED.
 void sg_light_add(struct sg_light *light, const struct sg_reading *reading);
 
 // Features of the cycles added since the last call, from the mean of their photocurrents:

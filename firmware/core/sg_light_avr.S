@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 ; sg_light_loop.c for AVR with a multiplier, bit-identical to it. Formats there.
 ;
-; The ordinary case of a channel is done here: same exposure as before, settled, on time, not full, light that rests
-; or moves in full. Whatever else there is, the C twin does, one channel at a time.
+; The ordinary case of a channel is done here: same exposure as before, settled, on time, not full, light that
+; rests or moves in full. Whatever else there is, the C twin does, one channel at a time.
 
 #if defined(__AVR__) && !defined(SG_LIGHT_PORTABLE)
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Codes and charges are counted in 1/32 (q5): 1023 codes are 32736, differences fit 16 bits signed and sums 16
-// bits unsigned.
+// Codes and charges are counted in 1/32 (q5): 1023 codes are 32736, differences fit 16 bits signed and sums
+// 16 bits unsigned.
 #include "sg_light_loop.h"
 
 #include "sg_light_table.h"
@@ -52,7 +52,8 @@ static uint16_t ratio_q16(uint16_t late, uint16_t rest)
 // Charge that a late release missed: what was collected in the rest of the exposure goes on as it came.
 //   code read, before: that of the sample capacitor before it
 // More than half missed: 0, and STARVED.
-static int16_t missed_q5(struct sg_light_channel *channel, uint16_t code, uint16_t before, uint8_t late_cycles)
+static int16_t missed_q5(struct sg_light_channel *channel, uint16_t code, uint16_t before,
+                         uint8_t late_cycles)
 {
     if (late_cycles == LATE_UNKNOWN || late_cycles >= channel->exposure_cycles >> 1) {
         channel->flags |= SG_LIGHT_STARVED;
@@ -116,7 +117,8 @@ static int16_t ambient_q5(const struct sg_light *light, struct sg_light_channel 
             return (int16_t)unlit_q5;
         }
     }
-    const int32_t meant = (int32_t)unlit_q5 + by_q8(past, light->before_q8) - by_q8(long_past, light->earlier_q8);
+    const int32_t meant = (int32_t)unlit_q5 + by_q8(past, light->before_q8)
+                        - by_q8(long_past, light->earlier_q8);
     return meant < 0 ? 0 : meant > INT16_MAX ? INT16_MAX : (int16_t)meant;
 }
 
@@ -128,7 +130,8 @@ void sg_light_begin(struct sg_light_channel *channel, uint16_t exposure_cycles, 
     settle(channel, sg_light_q5(unlit_code));
 }
 
-int16_t sg_light_meant(struct sg_light *light, const struct sg_reading *reading, uint8_t i, struct sg_light_pass *pass)
+int16_t sg_light_meant(struct sg_light *light, const struct sg_reading *reading, uint8_t i,
+                       struct sg_light_pass *pass)
 {
     struct sg_light_channel *channel = &light->channel[i];
     const uint16_t lit = reading->lit_code[i], unlit = reading->unlit_code[i];
@@ -197,18 +200,20 @@ void sg_light_prepare(struct sg_light *light, const struct sg_reading *reading)
 {
     for (uint8_t i = 0; i < SG_LIGHT_CHANNELS; i++) {
         struct sg_light_channel *channel = &light->channel[i];
-        const uint8_t gap = light->state & SG_LIGHT_GAP;
-        channel->unlit_q5[0] = channel->unlit_q5[1] = gap ? sg_light_q5(reading->unlit_code[i]) : channel->mean_q5;
+        channel->unlit_q5[0] = channel->mean_q5;
+        if (light->state & SG_LIGHT_GAP)
+            channel->unlit_q5[0] = sg_light_q5(reading->unlit_code[i]);
+        channel->unlit_q5[1] = channel->unlit_q5[0];
     }
     light->state &= SG_LIGHT_MOVES;
 }
 
 #ifndef SG_LIGHT_ASSEMBLY
-// Charge between an unlit and a lit code, less their difference D. With X the mean of both over 1024 and d half
-// their difference:  D (2 k1 X + 3 k2 (X^2 + d^2 / 3) + curve X / 512).
+// Charge between an unlit and a lit code, less their difference D. With X the mean of both over 1024 and d
+// half their difference:  D (2 k1 X + 3 k2 (X^2 + d^2 / 3) + curve X / 512).
 //   slope_q16   2 k1 + curve / 512
-// 65536 X is the sum of both codes. In the small term its upper byte does, which is half a step of 1/256 too small
-// on average: SG_LIGHT_SLOPE_Q16 makes that up. d^2 is the
+// 65536 X is the sum of both codes. In the small term its upper byte does, which is half a step of 1/256 too
+// small on average: SG_LIGHT_SLOPE_Q16 makes that up. d^2 is the
 // upper byte of (256 d)^2 over 256.
 // Overflow   the bracket is within -0.25 .. 0.44 in Q0.16.
 static int16_t bend_q5(uint16_t lit_q5, uint16_t unlit_q5, int16_t slope_q16)
@@ -218,7 +223,8 @@ static int16_t bend_q5(uint16_t lit_q5, uint16_t unlit_q5, int16_t slope_q16)
     const uint8_t x = (uint8_t)(sum >> 8);
     const int8_t d = (int8_t)(difference >> 8);
     const int16_t slope = (int16_t)(slope_q16 + (int16_t)(x * SG_LIGHT_CUBIC));
-    const int16_t bracket = (int16_t)((int16_t)(((int32_t)slope * sum) >> 16) + (int16_t)(((uint16_t)(d * d) >> 8) << SG_LIGHT_SQUARE_SHIFT));
+    const int16_t square = (int16_t)(((uint16_t)(d * d) >> 8) << SG_LIGHT_SQUARE_SHIFT);
+    const int16_t bracket = (int16_t)((int16_t)(((int32_t)slope * sum) >> 16) + square);
     return high(difference, bracket);
 }
 
@@ -234,8 +240,9 @@ void sg_light_add(struct sg_light *light, const struct sg_reading *reading)
         const uint8_t i = sg_rom_byte(order + k, SG_ROM_FLASH);
         struct sg_light_channel *channel = &light->channel[i];
         const uint16_t meant_q5 = (uint16_t)sg_light_meant(light, reading, i, &pass);
-        // Lit emitters lift the rail by 24 mV (0.3 ohm, 4 emitters of 20 mA), and a junction biased more holds less:
-        // 0.21 to 0.24 % of the code, here 2^-9 + 2^-12. Emitters of photodiodes do not flow through it.
+        // Lit emitters lift the rail by 24 mV (0.3 ohm, 4 emitters of 20 mA), and a junction biased more
+        // holds less: 0.21 to 0.24 % of the code, here 2^-9 + 2^-12. Emitters of photodiodes do not flow
+        // through it.
         const uint16_t lit_q5 = sg_light_q5(reading->lit_code[i]);
         const uint8_t lit_high = (uint8_t)(lit_q5 >> 8);
         const uint16_t rail = light->wiring ? 0 : (uint16_t)((lit_high >> 1) + (lit_high >> 4));

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// The part of sg_light that every cycle runs for every channel. Two twins with identical bits: sg_light_loop.c,
-// portable and whole, and sg_light_avr.S, which does the ordinary cases and leaves the others to it.
+// The part of sg_light that every cycle runs for every channel. Two twins with identical bits:
+// sg_light_loop.c, portable and whole, and sg_light_avr.S, which does the ordinary cases and leaves the
+// others to it.
 #ifndef SG_LIGHT_LOOP_H
 #define SG_LIGHT_LOOP_H
 
@@ -27,7 +28,7 @@ enum {
 
 // What passes from channel to channel within a cycle.
 struct sg_light_pass {
-    int16_t missed_q5;          // in: what the sample capacitor held from before the cycle; out: charge to add
+    int16_t missed_q5;          // in: held from before the cycle by the sample capacitor; out: to add
     uint16_t lit_code;          // as sampled right before, 0 after ground
     uint16_t unlit_code;
     int16_t departure;          // sum of the sixteenths of unlit departures from their means, 1/32 code
@@ -35,24 +36,40 @@ struct sg_light_pass {
 };
 
 // The assembly knows these places.
-_Static_assert(sizeof(struct sg_light_channel) == 20 && offsetof(struct sg_light_channel, exposure_cycles) == 4
-               && offsetof(struct sg_light_channel, unit_q12) == 6 && offsetof(struct sg_light_channel, unlit_q5) == 8
-               && offsetof(struct sg_light_channel, mean_q5) == 12 && offsetof(struct sg_light_channel, slope_q16) == 14
-               && offsetof(struct sg_light_channel, settled) == 16 && offsetof(struct sg_light_channel, cycles) == 17
-               && offsetof(struct sg_light_channel, flags) == 18, "channel layout");
-_Static_assert(offsetof(struct sg_light, before_q8) == 120 && offsetof(struct sg_light, earlier_q8) == 121
-               && offsetof(struct sg_light, moving) == 122 && offsetof(struct sg_light, wiring) == 124
-               && offsetof(struct sg_light, state) == 125
-               && offsetof(struct sg_light, zero_q5) == 126 && offsetof(struct sg_light, dither) == 127, "layout");
-_Static_assert(offsetof(struct sg_reading, held_code) == 48 && offsetof(struct sg_reading, unlit_code) == 12 && offsetof(struct sg_reading, exposure_cycles) == 24
-               && offsetof(struct sg_reading, late_lit_cycles) == 36
-               && offsetof(struct sg_reading, late_unlit_cycles) == 42, "reading layout");
+#define PLACE(type, field, at) _Static_assert(offsetof(struct type, field) == (at), #type " layout")
+_Static_assert(sizeof(struct sg_light_channel) == 20, "channel layout");
+PLACE(sg_light_channel, exposure_cycles, 4);
+PLACE(sg_light_channel, unit_q12, 6);
+PLACE(sg_light_channel, unlit_q5, 8);
+PLACE(sg_light_channel, mean_q5, 12);
+PLACE(sg_light_channel, slope_q16, 14);
+PLACE(sg_light_channel, settled, 16);
+PLACE(sg_light_channel, cycles, 17);
+PLACE(sg_light_channel, flags, 18);
+PLACE(sg_light, before_q8, 120);
+PLACE(sg_light, earlier_q8, 121);
+PLACE(sg_light, moving, 122);
+PLACE(sg_light, wiring, 124);
+PLACE(sg_light, state, 125);
+PLACE(sg_light, zero_q5, 126);
+PLACE(sg_light, dither, 127);
+PLACE(sg_reading, unlit_code, 12);
+PLACE(sg_reading, exposure_cycles, 24);
+PLACE(sg_reading, late_lit_cycles, 36);
+PLACE(sg_reading, late_unlit_cycles, 42);
+PLACE(sg_reading, held_code, 48);
+PLACE(sg_light_pass, missed_q5, 0);
+PLACE(sg_light_pass, lit_code, 2);
+PLACE(sg_light_pass, unlit_code, 4);
+PLACE(sg_light_pass, departure, 6);
+PLACE(sg_light_pass, unlit_more_q5, 8);
+#undef PLACE
 
 // 4096 * log2(1 + i / 64), in program memory.
 extern const uint16_t sg_light_log2_table[65];
 
-// Level behind a mean unlit code below SG_LIGHT_CLIPPED_Q5, both 1/32 code, the level plus 128: a code is never
-// negative, so noise raises a mean near 0.
+// Level behind a mean unlit code below SG_LIGHT_CLIPPED_Q5, both 1/32 code, the level plus 128: a code is
+// never negative, so noise raises a mean near 0.
 extern const uint8_t sg_light_clipped_table[SG_LIGHT_CLIPPED_Q5];
 
 // 4096 * log2(x), x in 1..65535: rounded, at most 1.5 off.
@@ -62,7 +79,8 @@ uint16_t sg_light_log2_q12(uint16_t x);
 void sg_light_begin(struct sg_light_channel *channel, uint16_t exposure_cycles, uint16_t unlit_code);
 
 // One channel's codes, up to the unlit code meant at the lit moment, which is returned, 1/32 code.
-int16_t sg_light_meant(struct sg_light *light, const struct sg_reading *reading, uint8_t i, struct sg_light_pass *pass);
+int16_t sg_light_meant(struct sg_light *light, const struct sg_reading *reading, uint8_t i,
+                       struct sg_light_pass *pass);
 
 // Feature of the cycles added to a channel, at least one; sets STARVED. The cycles stay.
 uint16_t sg_light_feature(struct sg_light_channel *channel);

@@ -14,7 +14,8 @@ _Static_assert((int)SG_LIGHT_SATURATED == (int)SG_FLAG_SATURATED, "flag value");
 _Static_assert((int)SG_LIGHT_STARVED == (int)SG_FLAG_STARVED, "flag value");
 _Static_assert((int)SG_LIGHT_CHANNELS == (int)SG_WIRE_CHANNELS, "channels");
 _Static_assert((int)SG_HEALTH_OPEN == (int)SG_FAULT_OPEN && (int)SG_HEALTH_SHORT == (int)SG_FAULT_SHORT
-               && (int)SG_HEALTH_LOW == (int)SG_FAULT_LOW && (int)SG_HEALTH_HIGH == (int)SG_FAULT_HIGH, "fault value");
+               && (int)SG_HEALTH_LOW == (int)SG_FAULT_LOW && (int)SG_HEALTH_HIGH == (int)SG_FAULT_HIGH,
+               "fault value");
 _Static_assert((int)SG_EXPOSE_SATURATED_CODE == (int)SG_LIGHT_SATURATED_CODE
                && (int)SG_HEALTH_FULL_CODE == (int)SG_LIGHT_SATURATED_CODE, "one idea of full");
 

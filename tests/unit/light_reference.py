@@ -14,7 +14,8 @@ JUNCTION_PF, JUNCTION_V, POWER = 40.0, 0.7, 0.4
 PIN_PF, SAMPLE_PF = 6.0, 14.0
 UNIT_NA = 0.0625
 PAIRS = {lib.SG_WIRING_LEDS: ((5, 0), (1, 4), (2, 3)), lib.SG_WIRING_PHOTODIODES: ((0, 3), (1, 4), (2, 5))}
-# One random error of a code at an ADC clock of 250 kHz: physics.toml's 0.7 at 200 kHz, growing to 2.25 times at 1 MHz.
+# One random error of a code at an ADC clock of 250 kHz: physics.toml's 0.7 at 200 kHz, growing to 2.25 times
+# at 1 MHz.
 NOISE_LSB = 0.7 * (1 + 1.25 * 50 / 800)
 SLOTS, LIT_TO_UNLIT_SLOTS = 18, 3
 CLOCK_HZ = 16e6
@@ -33,7 +34,8 @@ def junction_pc(volts, rail=RAIL_V):
 def node_pc(code, before=0.0, rail=RAIL_V):
     """Charge collected by a node that reads `code` when the sample capacitor came from `before`, pC."""
     volts = REFERENCE_V * np.asarray(code, float) / 1024
-    return junction_pc(volts, rail) + (PIN_PF + SAMPLE_PF) * volts - SAMPLE_PF * REFERENCE_V * np.asarray(before, float) / 1024
+    brought = SAMPLE_PF * REFERENCE_V * np.asarray(before, float) / 1024
+    return junction_pc(volts, rail) + (PIN_PF + SAMPLE_PF) * volts - brought
 
 
 _CODES = np.linspace(-300, 1900, 22001)

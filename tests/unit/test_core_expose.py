@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""sg_expose: exposures that find their place and stay there, on simulated sensors behind a pipeline of two cycles."""
+"""sg_expose: exposures that find their place and stay there, behind a pipeline of two cycles."""
 import numpy as np
 import pytest
 
@@ -37,7 +37,8 @@ class Sensors:
         ambient = ambient_na(self.t) if callable(ambient_na) else ambient_na
         later = ambient_na(self.t + self.cycle_s / 6) if callable(ambient_na) else ambient_na
         def codes(current_na):
-            seen = read(collected_pc(np.broadcast_to(current_na, 6), self.exposure)) + noise * self.rng.standard_normal(6)
+            seen = read(collected_pc(np.broadcast_to(current_na, 6), self.exposure))
+            seen = seen + noise * self.rng.standard_normal(6)
             return np.clip(np.floor(seen + 0.5), 0, 1023).astype(int)
         self.lit, self.unlit = codes(np.asarray(signal_na) + ambient), codes(later)
         before = self.asked()
@@ -94,7 +95,8 @@ def test_from_the_longest_exposure_to_full_sun_in_at_most_three_corrections():
     assert (sensors.asked() == MOST).all()
     sensors.changes[:] = 0
     full, last = sensors.run(CAPPED_NA, SUN_NA, 60)
-    print(f"sun: {full} full cycles, exposures {sensors.asked() / 16} us after {last} cycles, {sensors.changes} changes")
+    print(f"sun: {full} full cycles, exposures {sensors.asked() / 16} us after {last} cycles, "
+          f"{sensors.changes} changes")
     assert full <= 5 and last <= 10 and sensors.changes.max() <= 3
     assert meets_goal(sensors, CAPPED_NA, SUN_NA)
 
@@ -236,7 +238,8 @@ def test_a_port_s_least_exposure_is_learnt_and_not_asked_to_be_less():
 def test_start_clips_and_any_codes_keep_the_limits():
     rng = np.random.default_rng(1)
     state = ffi.new("struct sg_expose *")
-    for start, most, expected in ((0, 1656, MIN), (65535, 65535, MAX), (2000, 1656, 1656), (777, 1656, 777), (0, 0, MIN)):
+    for start, most, expected in ((0, 1656, MIN), (65535, 65535, MAX), (2000, 1656, 1656), (777, 1656, 777),
+                                  (0, 0, MIN)):
         lib.sg_expose_start(state, [start] * 6, [most] * 6)
         assert [led.exposure_cycles for led in state.led] == [expected] * 6
         limit = max(MIN, min(most, MAX))

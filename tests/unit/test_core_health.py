@@ -23,7 +23,8 @@ class Health:
         """Looks in a row; returns the fault bits by look."""
         seen = []
         for _ in range(looks):
-            any_fault = lib.sg_health_look(self.state, channel, ffi.new("struct sg_health_sight *", {**GOOD, **changed}))
+            sight = ffi.new("struct sg_health_sight *", {**GOOD, **changed})
+            any_fault = lib.sg_health_look(self.state, channel, sight)
             assert any_fault == any(self.state.fault)
             seen.append(self.state.fault[channel])
         return seen

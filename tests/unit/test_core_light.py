@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""sg_light against a float64 model of nodes, pairs and converter: charge, ambient light, noise, and the hard cases."""
+"""sg_light against a float64 model of nodes, pairs and converter: charge, ambient light, noise, hard cases."""
 import numpy as np
 import pytest
 
-from light_reference import (BRIGHT_ROOM_NA, CAPS, LIT_RAIL_V, NOISE_LSB, PAIRS, RAIL_V, ROOM_NA, SUN_NA, Board, Light,
-                             collected_pc, feature_noise, node_pc, read, true_feature)
+from light_reference import (BRIGHT_ROOM_NA, CAPS, LIT_RAIL_V, NOISE_LSB, PAIRS, RAIL_V, ROOM_NA, SUN_NA,
+                             Board, Light, collected_pc, feature_noise, node_pc, read, true_feature)
 from sparsegaze._core import ffi, lib
 
 SATURATED, STARVED = lib.SG_FLAG_SATURATED, lib.SG_FLAG_STARVED
@@ -124,7 +124,8 @@ def test_feature_does_not_depend_on_the_exposure_within_a_thousandth(ambient_na)
         settle(board, light)
         found.append(light.run(board, 1500)[0].mean(axis=0))
     spread = np.ptp(found, axis=0).max() * np.log(2) / 4096
-    print(f"ambient {ambient_na} nA: {spread:.2e} of the current over exposures 400..1400 cycles; bound 1e-3 or 0.15 code")
+    print(f"ambient {ambient_na} nA: {spread:.2e} of the current over exposures 400..1400 cycles; "
+          "bound 1e-3 or 0.15 code")
     shortest = read(collected_pc(90 + ambient_na, 400)) - read(collected_pc(ambient_na, 400))
     assert spread <= max(1e-3, 0.15 / shortest)     # the shortest exposure has few codes, of which 0.15 is the error
 
@@ -273,7 +274,8 @@ def test_full_sun_is_measured_at_short_exposures_and_saturated_at_long_ones():
     got, flags = light.run(board, 800)
     assert not flags.any()
     error = np.abs(2 ** ((got.mean(axis=0) - true_feature(120.0)) / 4096) - 1).max()
-    print(f"full sun: mean current within {100 * error:.2f} %, one frame {got.std(axis=0).mean() * np.log(2) / 40.96:.1f} % rms")
+    rms = got.std(axis=0).mean() * np.log(2) / 40.96
+    print(f"full sun: mean current within {100 * error:.2f} %, one frame {rms:.1f} % rms")
     assert error <= 0.01
     board.exposure[:] = 1000
     _, flags = light.run(board, 5)
@@ -372,7 +374,8 @@ def test_a_release_too_late_to_make_up_for_is_starved_not_wild():
     assert light.frame(board.cycle())[1] == 0
 
 
-@pytest.mark.parametrize("offset,ambient_codes", [(-2.0, 0.0), (-2.0, 0.8), (-1.0, 0.0), (-2.0, 1.5), (2.0, 0.0), (0.0, 0.0)])
+@pytest.mark.parametrize("offset,ambient_codes", [
+    (-2.0, 0.0), (-2.0, 0.8), (-1.0, 0.0), (-2.0, 1.5), (2.0, 0.0), (0.0, 0.0)])
 def test_codes_clipped_at_0_by_a_negative_offset(offset, ambient_codes):
     exposure = 1656
     ambient = ambient_codes / read(collected_pc(1.0, exposure))
@@ -386,7 +389,8 @@ def test_codes_clipped_at_0_by_a_negative_offset(offset, ambient_codes):
         errors[name] = abs(got[:, 5].mean() - true_feature(150)) * np.log(2) / 4096 * signal_code
         noise = got[:, 5].std() / feature_noise(150, signal_code, 1 / 31, exposure)
     print(f"offset {offset:+}, ambient {ambient_codes} codes: " +
-          ", ".join(f"{name} {error:.2f} codes off" for name, error in errors.items()) + f"; noise {noise:.2f} of expected")
+          ", ".join(f"{name} {error:.2f} codes off" for name, error in errors.items()) + 
+          f"; noise {noise:.2f} of expected")
     assert errors["zero known"] <= 0.75 and errors["zero unknown"] <= 2.2
     assert noise <= 1.2
 
@@ -432,6 +436,7 @@ def test_any_reading_is_legal():
             "lit_code": rng.integers(0, high, 6).tolist(), "unlit_code": rng.integers(0, high, 6).tolist(),
             "exposure_cycles": rng.choice([0, 1, 64, 900, 5216, 65535], 6).tolist(),
             "late_lit_cycles": rng.choice([0, 0, 0, 1, 255], 6).tolist(),
-            "late_unlit_cycles": rng.choice([0, 0, 0, 130, 254], 6).tolist(), "held_code": int(rng.choice([0, 0, 1023]))})
+            "late_unlit_cycles": rng.choice([0, 0, 0, 130, 254], 6).tolist(),
+            "held_code": int(rng.choice([0, 0, 1023]))})
         got, flags = light.frame(*[reading] * int(rng.integers(1, 4)))
         assert flags & ~(SATURATED | STARVED) == 0 and ((got >= 0) & (got <= 65535)).all()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""sg_light on a simulated ATmega328P: both twins and the host give the same bits, in the ordinary case and out of it."""
+"""sg_light on a simulated ATmega328P: both twins and the host give the same bits, ordinary case or not."""
 import numpy as np
 import pytest
 
@@ -57,7 +57,8 @@ def readings(rng, n, hard):
             else:
                 late = rng.integers(0, 60, (2, 6))
         words = np.concatenate([np.clip(np.floor([*lit, *unlit]), 0, 1023), exposure]).astype(np.uint16)
-        rows.append(words.tobytes() + late.astype(np.uint8).tobytes() + np.uint16(held).tobytes() + bytes([act, 0]))
+        rows.append(words.tobytes() + late.astype(np.uint8).tobytes() + np.uint16(held).tobytes()
+                    + bytes([act, 0]))
     return np.frombuffer(b"".join(rows), np.uint8).reshape(n, 52)
 
 
