@@ -9,10 +9,10 @@
 enum app_rate_cost {
     COST_SENSE = 4250,          // interrupts of one sensing cycle; they send the gaze as well
     COST_FRAME = 3950,          // readings, features, exposure and health of one channel, the loop
-    COST_MODEL = 2750,          // inference: with any model, and per vector, with the interrupts of that time
-    COST_VECTOR = 176,
+    COST_MODEL = 2150,          // inference: with any model, and per vector, with the interrupts of that time
+    COST_VECTOR = 206,
     COST_GAZE = 1030,           // its packet
-    COST_RAW = 5300,            // and sending it
+    COST_RAW = 5800,            // and sending it
     COST_COUNTS = 7000,
     COST_REQUEST = 450,          // a look at the line; a request makes a frame wait
 };

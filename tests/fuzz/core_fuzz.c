@@ -290,7 +290,7 @@ static void fuzz_sense(void)
             int8_t curve[SG_LIGHT_CHANNELS];
             for (int j = 0; j < SG_LIGHT_CHANNELS; j++)
                 curve[j] = (int8_t)(draw(256) - 128);
-            sg_light_curve(&light, curve);
+            sg_light_curve(&light, curve, (int8_t)-(int)draw(129));
         }
         if (draw(16) == 0)
             sg_light_gap(&light);
