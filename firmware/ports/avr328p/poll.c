@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The main loop's turn, and the descriptions that need more than one part of the port.
-#include "port.h"
+#include "port_sense.h"
+#include "port_serial.h"
 
 #include <avr/wdt.h>
 
@@ -37,16 +38,16 @@ void hal_start(struct hal_timing *timing, uint16_t exposure_cycles[HAL_CHANNELS]
 
 static void sleep_if_idle(void)
 {
-    if (!sense_idle())
+    if (!sense_idle() || !serial_idle())
         return;
-    cli();
-    if (sense_idle() && serial_idle()) {
-        SMCR = 1 << SE;         // idle: timers, converter and serial line go on
+    SMCR = 1 << SE;             // idle: timers, converter and serial line go on
+    cli();                      // for as short as can be: a release may be waiting
+    if (sense_done == sense_took && rx_head == rx_tail) {
         sei();                  // takes effect after the next instruction: no interrupt is slept through
         __asm__ volatile("sleep");
-        SMCR = 0;
     }
     sei();
+    SMCR = 0;
 }
 
 int hal_poll(void)

@@ -109,6 +109,7 @@ extern volatile uint8_t sense_current;                   // index of the running
 extern uint8_t *sense_first;                    // ADMUX of slot 0 to be set back to GND; NULL: it is
 extern volatile uint8_t sense_pauses;           // changes when sense_base does without sense_done
 extern volatile uint8_t sense_done;             // cycles complete, low byte
+extern uint8_t sense_took;                      // cycles taken, low byte
 
 // Called by the interrupt, seldom. OCR1A is the match it was called at.
 const uint8_t *sense_wait(void);                // the pause goes on or ends; the list to go on with

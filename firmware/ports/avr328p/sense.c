@@ -58,7 +58,7 @@ static __uint24 pause_new;
 static uint8_t timing_new, plan_new;        // asked for and not in a plan yet
 static uint8_t written;                     // lists of the next plan
 static uint8_t locked_out;
-static uint8_t took;                        // cycles taken, low byte
+uint8_t sense_took;                         // cycles taken, low byte
 static uint16_t late_frames;
 static uint32_t frames;
 static uint16_t took_at;                    // TCNT1, and its wraps
@@ -422,7 +422,7 @@ HOT uint8_t sense_take(struct hal_cycle *cycle)
     const struct taken *from;
     uint8_t done;
     uint32_t wraps;
-    if (sense_done == took)
+    if (sense_done == sense_took)
         return 0;
     HAL_BEGIN(HAL_SECTION_FRAME);
     do {
@@ -431,8 +431,8 @@ HOT uint8_t sense_take(struct hal_cycle *cycle)
         took_wraps = (uint8_t)now(&took_at);
         wraps = sense_wraps;
     } while (done != sense_done);
-    late_frames += (uint8_t)(done - took - 1);
-    took = done;
+    late_frames += (uint8_t)(done - sense_took - 1);
+    sense_took = done;
 
     // Read without a lock: the interrupt comes back to this one when the other is complete.
     if (from->plan != shown_plan)
@@ -471,13 +471,13 @@ void sense_taken(void)
     spent = wraps ? UINT16_MAX : spent - took_at;
     if (cycles_max < spent)
         cycles_max = spent;
-    late_frames += sense_done != took;
+    late_frames += sense_done != sense_took;
     HAL_END(HAL_SECTION_FRAME);
 }
 
 uint8_t sense_idle(void)
 {
-    return timing.sleep && sense_done == took;
+    return timing.sleep && sense_done == sense_took;
 }
 
 uint8_t hal_alarm(void)
