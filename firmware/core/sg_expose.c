@@ -12,7 +12,7 @@ enum {
     CAUTION_MOST = 6,
     ACQUIRED_A_CYCLE = 2,
     LEAST_MOST = 1024,          // a port that takes more instead has other reasons
-    SOON_LOOKS = 32,            // 0.2 s
+    SOON_LOOKS = 5,             // 30 ms: a crest comes within 10 ms
     SETTLED_LOOKS = 4,
     WATCH_LOOKS = 5,            // 30 ms: five phases of a period of 10 ms
     SLOW_ROUNDS = 170,          // 1 s at 6 ms a round
@@ -184,6 +184,7 @@ static void watch_ambient(struct sg_expose *expose, const struct sg_expose_led *
     expose->fallen = 0;
     expose->acquiring = 1;
     for (uint8_t i = 0; i < CHANNELS; i++) {
+        expose->led[i].caution = 0;
         if (expose->led[i].exposure_cycles < expose->led[i].most_cycles)
             expose->led[i].stage = SG_EXPOSE_ACQUIRE;
     }

@@ -118,6 +118,18 @@ def test_ambient_steps_of_1000_to_1_up_and_down(high_na):
         assert meets_goal(sensors, CAPPED_NA, low_na)
 
 
+@pytest.mark.parametrize("apart", [60, 101, 250])
+def test_steps_that_follow_each_other_are_each_followed_at_once(apart):
+    sensors, seen = Sensors(), []
+    sensors.run(CAPPED_NA, 2, 300)
+    for _ in range(8):
+        seen.append((*sensors.run(CAPPED_NA, 2000, apart), *sensors.run(CAPPED_NA, 2, apart)))
+    full, up, _, down = np.max(seen, axis=0)
+    print(f"steps {apart} cycles apart: at most {full} full cycles, settled after {up} up and {down} down")
+    assert full <= 5 and up <= 10 and down <= 10
+    assert meets_goal(sensors, CAPPED_NA, 2)
+
+
 @pytest.mark.parametrize("step", [2, 5, 20, 100])
 def test_any_step_of_ambient_light_is_followed_without_patience(step):
     sensors = Sensors()
