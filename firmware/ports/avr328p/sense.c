@@ -127,13 +127,6 @@ uint32_t hal_now_us(void)
     return us_of(wraps, ticks);
 }
 
-HOT uint16_t hal_now_us16(void)
-{
-    uint16_t ticks;
-    const uint16_t wraps = (uint16_t)now(&ticks);
-    return (uint16_t)(wraps << 12) | ticks >> 4;
-}
-
 static struct taken *filling(void)
 {
     const uint16_t *out;
@@ -153,6 +146,28 @@ static void ask_supply(struct plan *plan, uint8_t of)
     supply_of = of;
     *plan->first_mux = ADMUX_SUPPLY;
     sense_first = plan->first_mux;
+}
+
+// Its other GND slot must be over, and the same plan go on. Interrupts stay on: what is left of the cycle is
+// long.
+SELDOM static void try_supply(void)
+{
+    if (supply != SUPPLY_WANTED || sense_current != plan_next || sense_list_next != sense_plan[plan_next].event)
+        return;
+    const uint8_t done = sense_done;
+    const uint16_t since = ticks_now() - sense_base;
+    if (since > 3 * sense_slot && since < 15 * sense_slot && done == sense_done)
+        ask_supply(&sense_plan[plan_next], done + 2);
+}
+
+HOT uint16_t hal_now_us16(void)
+{
+    uint16_t ticks;
+    // Under full load the main loop comes by here alone while a cycle is half over.
+    if (supply == SUPPLY_WANTED)
+        try_supply();
+    const uint16_t wraps = (uint16_t)now(&ticks);
+    return (uint16_t)(wraps << 12) | ticks >> 4;
 }
 
 // A frame whose first cycle's hold is at `hold`, by TCNT1. Called with interrupts off.
@@ -329,15 +344,7 @@ void sense_poll(void)
     // The other plan is free when neither the running cycle nor the newest complete one follows it.
     if ((plan_new || written) && sense_current == plan_next && filling()->other->plan == plan_next)
         write_plan();
-    // Its other GND slot must be over, and the same plan go on. Interrupts stay on: what is left of the cycle
-    // is long.
-    if (supply == SUPPLY_WANTED && sense_current == plan_next
-        && sense_list_next == sense_plan[plan_next].event) {
-        const uint8_t done = sense_done;
-        const uint16_t since = ticks_now() - sense_base;
-        if (since > 3 * sense_slot && since < 12 * sense_slot && done == sense_done)
-            ask_supply(&sense_plan[plan_next], done + 2);
-    }
+    try_supply();
 }
 
 SELDOM void sense_start(struct hal_timing *t, uint16_t exposure_cycles[HAL_CHANNELS])
