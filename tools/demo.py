@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from demo_picture import draw
-from sparsegaze import calibrate, flash, metrics, targets, validate
+from sparsegaze import calibrate, flash, metrics, session, targets, validate
 from sparsegaze.device import Device
 from sparsegaze.errors import SparsegazeError
 from sparsegaze.headset import load_headset
@@ -30,10 +30,14 @@ from sparsegaze.wire import lib
 
 HEADSET = Path(__file__).resolve().parent.parent / "headsets" / "led2gaze.toml"
 CPU_MHZ = 16.0
+ORDER = (5, 0, 1, 4, 2, 3)          # of the channels in a sensing cycle
+SLACK_CYCLES = 48                   # times of the device are whole microseconds
 FRESH_S, READY_S = 600.0, 240.0     # bars: whole run on a fresh clone, and when set up
 LOSS_MOST = 0.2                     # bar: blinks alone cost about 0.09 (15 a minute, 0.24 s and the hold after each)
 TARGETS, HELD_OUT = 120, 25
-RESULTS = ("report.json", "demo.png", "map.png", "gaze.csv", "latency.csv", "recording.csv", "model.sgm")
+ALONE_S = 4.0                       # of the gaze stream alone, for the latency
+RESULTS = ("report.json", "demo.png", "map.png", "gaze.csv", "latency.csv", "latency_features.csv", "recording.csv",
+           "model.sgm")
 SECTION_INFER, SECTION_FRAME = "0", "5"     # GPIOR0 sections of the firmware: inference, and all work on a frame
 
 # The demo's bars are about a full model; left alone, calibrate takes the fewest vectors that do, some 25.
@@ -97,11 +101,11 @@ def run(options):
         with Device(nano.port) as device:
             before = model_crc(device)
     say(f"power cycled; streaming over {options.held_out} held-out targets in real time")
-    latency_log = out / "latency.csv"
+    alone_log, features_log = out / "latency.csv", out / "latency_features.csv"
     with VirtualNano(person=seed, state_dir=state) as nano:
         with Device(nano.port) as device:
             after = model_crc(device)
-            nano.control.frames(latency_log)
+            nano.control.frames(features_log)
             nano.control.markers_clear()
             calibrated = calibration.capture.run.plan.target_deg
             plan = targets.validation_plan(options.held_out, seed, avoid_deg=calibrated)
@@ -109,6 +113,7 @@ def run(options):
             nano.control.frames(None)
             sections, counters = nano.control.markers(), nano.control.counters()
             status, period_us, limit_hz = device.status(), *timing(device)
+            alone = gaze_alone(device, nano.control, alone_log)
     measured = validation.report()
     process = calibration.fit.gp.predict(validation.run.frames["features"].astype(float))
     gp_deg = np.asarray(process[0] if isinstance(process, tuple) else process)
@@ -134,7 +139,9 @@ def run(options):
                       "cycles_with_interrupts": infer.most},
         "frame": {"cycles": sections[SECTION_FRAME + "n"].most, "cycles_mean": sections[SECTION_FRAME + "n"].mean,
                   "cycles_with_interrupts": frame.most, "period_cycles": period_us * CPU_MHZ},
-        "latency_ms": latency(latency_log, validation.run.frames, validation.run.offset_us), "counters": counters,
+        "latency_ms": {**latency(alone_log, alone, validation.run.offset_us, packets=1),
+                       "with_features": latency(features_log, validation.run.frames, validation.run.offset_us, packets=2)},
+        "counters": counters,
         "device": {key: calibrate.plain(getattr(status, key)) for key in
                    ("late_frames", "late_slots", "tx_dropped", "rx_bad", "rx_overrun", "saturated", "starved", "stack_free",
                     "fault", "alarm", "supply_mv", "cycles_max")},
@@ -162,36 +169,95 @@ def timing(device):
     return now.frame_period_us, now.rate_limit_hz
 
 
+def gaze_alone(device, control, path):
+    """Stream the gaze alone for ALONE_S, as an application would, the virtual Nano's log in `path`: FRAMEs."""
+    rows = []
+    device.set_stream(gaze=True)
+    control.frames(path)
+    for frame in device.frames():
+        rows.append((frame.seq, frame.t_us, frame.gaze.infer_us))
+        if frame.t_us - rows[0][1] > ALONE_S * 1e6:
+            break
+    control.frames(None)
+    device.set_stream()
+    frames = np.zeros(len(rows), session.FRAME)
+    frames["seq"], frames["t_us"], frames["infer_us"] = np.array(rows).T
+    frames["has_gaze"] = True
+    return frames
+
+
 def model_crc(device):
     """CRC-32 of the model the device uses, computed afresh on the device over its flash; 0 without one."""
     info = device.model_info()
     return 0 if info.active == lib.SG_SLOT_NONE else device.verify(info.active).crc
 
 
-def latency(path, frames, offset_us):
+def latency(path, frames, offset_us, packets):
     """Mean sample time, and last sample, to the last byte's stop bit of the gaze frame; ms of device time.
 
-    path        the virtual Nano's log of cycles, of which the ends of sent packets are used (event "delimiter")
-    frames      record array of session.FRAME: t_us is a frame's mean sample time, its last sample span_us later, and
-                its inference was done infer_us after that; the first packet then is the gaze, the second the features
-    offset_us   device time minus the virtual Nano's time
+    path        the virtual Nano's log of cycles: lights, pins, samples and ends of packets
+    frames      record array of session.FRAME, which say when each inference was done: the packet whose end is next is
+                the gaze
+    offset_us   device time minus the virtual Nano's time, to some 0.5 ms: which sensing cycle a frame is of
+    packets     of a frame: 1 or 2
     Frames with anything else on the line, such as the answer to a ping, are left out.
     """
-    with open(path, newline="", encoding="ascii") as file:
-        sent = np.array([int(row["cycle"]) for row in csv.DictReader(file) if row["event"] == "delimiter"], np.int64)
+    mean, last, sent = moments(path)
     frames = frames[frames["has_gaze"]]
-    mean = (frames["t_us"] - offset_us) * CPU_MHZ
-    last = mean + frames["span_us"] * CPU_MHZ
-    ready = last + frames["infer_us"] * CPU_MHZ
-    first = np.searchsorted(sent, ready)
-    alone = np.flatnonzero((np.diff(first) == 2) & (np.diff(frames["seq"]) == 1))
+    at = (frames["t_us"] - offset_us) * CPU_MHZ
+    nothing = SparsegazeError("the virtual Nano logged no frame whose bytes could be told apart", "run the demo again")
+    if not len(mean) or not len(at):
+        raise nothing
+    at -= np.median(at - mean[nearest(mean, at)])
+    cycle = nearest(mean, at)
+    first = np.searchsorted(sent, last[cycle] + frames["infer_us"] * CPU_MHZ - SLACK_CYCLES)
+    alone = np.flatnonzero((np.diff(first) == packets) & (np.diff(frames["seq"]) == 1) & (np.diff(cycle) == 1)
+                           & (np.abs(at - mean[cycle])[:-1] < SLACK_CYCLES))
     if not len(alone):
-        raise SparsegazeError("the virtual Nano logged no frame whose bytes could be told apart", "run the demo again")
+        raise nothing
     end, ms = sent[first[alone]], 1e-3 / CPU_MHZ
-    from_mean, from_last = (end - mean[alone]) * ms, (end - last[alone]) * ms
+    from_mean, from_last = (end - mean[cycle[alone]]) * ms, (end - last[cycle[alone]]) * ms
     return {"frames": len(alone),
             "mean_sample_to_last_byte": from_mean.mean(), "mean_sample_to_last_byte_max": from_mean.max(),
             "last_sample_to_last_byte": from_last.mean(), "last_sample_to_last_byte_max": from_last.max()}
+
+
+def moments(path):
+    """Of a log, in cycles: (mean middle of six lit exposures [n], last sample [n]) of sensing cycles, ends of packets.
+
+    Rows event,cycle: lit:<mask>; drive<pin>:<3 released>; adc:<channel sampled>; delimiter. A sensing cycle samples the
+    channels in ORDER, pair after pair, each pair lit and then unlit.
+    """
+    mean, last, sent, middles, released, lit, unlit = [], [], [], [], {}, False, 0
+    with open(path, newline="", encoding="ascii") as file:
+        for row in csv.DictReader(file):
+            kind, _, value = row["event"].partition(":")
+            cycle = int(row["cycle"])
+            if kind == "lit":
+                lit = value != "0"
+            elif kind == "delimiter":
+                sent.append(cycle)
+            elif kind[:5] == "drive" and value == "3":
+                released[int(kind[5:])] = cycle
+            elif kind == "adc" and int(value) < len(ORDER):
+                channel = int(value)
+                if lit and channel == ORDER[0]:
+                    middles, unlit = [], 0
+                if lit and channel == ORDER[len(middles) % len(ORDER)] and channel in released:
+                    middles.append((released[channel] + cycle) / 2)
+                unlit += not lit
+                if len(middles) == len(ORDER) and channel == ORDER[-1] and not lit and unlit == len(ORDER):
+                    mean.append(np.mean(middles))
+                    last.append(cycle)
+    return np.array(mean), np.array(last), np.array(sent, np.int64)
+
+
+def nearest(times, at):
+    """Index of the nearest of `times` (ascending) for each of `at`."""
+    right = np.clip(np.searchsorted(times, at), 1, max(len(times) - 1, 1))
+    left = right - 1
+    return np.where(np.abs(at - times[left]) <= np.abs(times[np.minimum(right, len(times) - 1)] - at), left,
+                    np.minimum(right, len(times) - 1))
 
 
 def bars(report):

@@ -106,9 +106,9 @@ def _numbers(axis, report):
         ("calibration vectors on the device", f"{report['model']['n_vectors']}"),
         ("inference, worst", f"{report['inference']['cycles']:.0f} cycles"),
         ("all work on a frame, worst", f"{report['frame']['cycles']:.0f} of {report['frame']['period_cycles']:.0f} cycles"),
-        ("mean sample to last byte (worst)",
+        ("gaze stream: mean sample to last byte (worst)",
          f"{delay['mean_sample_to_last_byte']:.2f} ({delay['mean_sample_to_last_byte_max']:.2f}) ms"),
-        ("last sample to last byte (worst)",
+        ("gaze stream: last sample to last byte (worst)",
          f"{delay['last_sample_to_last_byte']:.2f} ({delay['last_sample_to_last_byte_max']:.2f}) ms"),
         ("flash written and verified", f"{report['flash']['bytes']} bytes"),
     ]

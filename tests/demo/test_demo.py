@@ -25,6 +25,7 @@ stream.seconds stream.rate_hz stream.frames stream.lost stream.bit_identical
 accuracy.mean_deg accuracy.median_deg accuracy.p95_deg accuracy.accuracy_deg accuracy.rms_s2s_deg
 accuracy.data_loss accuracy.to_true_gaze_mean_deg
 accuracy.gp64_mean_deg inference.cycles frame.cycles latency_ms.mean_sample_to_last_byte
+latency_ms.with_features.last_sample_to_last_byte
 latency_ms.last_sample_to_last_byte stream.limit_hz
 """.split()
 
@@ -89,52 +90,77 @@ def test_a_fresh_clone_has_ten_minutes(good):
 FRAME_CYCLES = 24_000
 
 
-def log(path, *packets):
-    rows = "".join(f"adc:3,{cycle - 9}\ndelimiter,{cycle}\n" for cycle in packets)
-    path.write_text("event,cycle\nrelease,5\nsample,9\n" + rows)
+def log(path, cycles, packets, first=0):
+    """A log of sensing cycles 1.5 ms apart and of packets; from its row `first` on."""
+    rows = [(cycle, "delimiter") for cycle in packets]
+    for k in range(cycles):
+        at = FRAME_CYCLES * k
+        for phase, pair in enumerate(((5, 0), (1, 4), (2, 3))):
+            # A phase of 8000 cycles: lit exposures of 1000 end at 4000 and 5000, unlit ones at 7000 and 8000.
+            for lit, end in ((1, 4000), (0, 7000)):
+                rows.append((at + 8000 * phase + end - 1500, f"lit:{60 * lit}"))
+                for i, channel in enumerate(pair):
+                    rows.append((at + 8000 * phase + end + 1000 * i - 1000, f"drive{channel}:3"))
+                    rows.append((at + 8000 * phase + end + 1000 * i, f"adc:{channel}"))
+            rows.append((at + 8000 * phase + 5900, "adc:15"))
+    lines = [f"{event},{cycle}\n" for cycle, event in sorted(rows)]
+    path.write_text("event,cycle\n" + "".join(lines[first:]))
     return path
 
 
+MEAN, LAST = 4000 + 8000, 3 * 8000      # of the middles of all six; the last unlit sample: 0.75 ms later
+
+
 def frames_of(n, offset_us=0, lost=()):
-    """n frames 1.5 ms apart: mean sample time 1 ms into each, last sample 0.4 ms later, inference 0.9 ms."""
+    """What the device says of n such cycles: it was done 0.9 ms after the last sample."""
     frames = np.zeros(n, session.FRAME)
-    frames["seq"], frames["has_gaze"], frames["span_us"], frames["infer_us"] = np.arange(n), True, 400, 900
-    frames["t_us"] = 1000 + 1500 * np.arange(n) + offset_us
+    frames["seq"], frames["has_gaze"], frames["infer_us"] = np.arange(n), True, 900
+    frames["t_us"] = MEAN // 16 + 1500 * np.arange(n) + offset_us
     return frames[[i for i in range(n) if i not in lost]]
 
 
 def packets_of(n, late=()):
-    """Ends of the gaze's packet 2.5 ms into each frame, 0.01 ms later in `late`; of the features' 0.4 ms later."""
+    """Ends of the gaze's packet 1.1 ms after the last sample, 0.01 more in `late`; the features' 0.4 later."""
     ends = []
     for i in range(n):
-        gaze = 40_000 + FRAME_CYCLES * i + (160 if i in late else 0)
+        gaze = LAST + 17_600 + FRAME_CYCLES * i + (160 if i in late else 0)
         ends += [gaze, gaze + 6400]
     return ends
 
 
 @pytest.mark.parametrize("offset_us", [0, 12_345, -777])
-def test_latency_is_from_the_devices_times_to_the_first_packet_after_the_inference(tmp_path, offset_us):
-    path = log(tmp_path / "log.csv", *packets_of(6, late=[2]))
-    found = demo.latency(path, frames_of(6, offset_us), offset_us)
-    assert found["frames"] == 5     # the last has no next one to end it
-    assert found["mean_sample_to_last_byte"] == pytest.approx(1.5 + 0.01 / 5)
-    assert found["mean_sample_to_last_byte_max"] == pytest.approx(1.51)
-    assert found["last_sample_to_last_byte"] == pytest.approx(1.1 + 0.01 / 5)
+@pytest.mark.parametrize("first", [0, 3, 7, 20], ids=lambda first: f"from row {first}")
+@pytest.mark.parametrize("wrong_us", [0, 400, -400])
+def test_latency_is_from_the_pins_to_the_next_packet_s_end(tmp_path, offset_us, first, wrong_us):
+    path = log(tmp_path / "log.csv", 9, packets_of(9, late=[2]), first)
+    found = demo.latency(path, frames_of(6, offset_us), offset_us + wrong_us, packets=2)
+    whole = 5 if first == 0 else 4      # the last has no next one; the log not all of the first cycle
+    assert found["frames"] == whole
+    assert found["mean_sample_to_last_byte"] == pytest.approx(1.1 + 0.75 + 0.01 / whole)
+    assert found["mean_sample_to_last_byte_max"] == pytest.approx(1.1 + 0.75 + 0.01)
+    assert found["last_sample_to_last_byte"] == pytest.approx(1.1 + 0.01 / whole)
     assert found["last_sample_to_last_byte_max"] == pytest.approx(1.11)
 
 
 def test_latency_leaves_out_frames_with_another_packet_on_the_line_or_that_were_lost(tmp_path):
-    answer = 40_000 + 2 * FRAME_CYCLES - 1000   # of a ping, before the third frame's gaze, which it delays
-    ends = sorted([answer, *packets_of(8)])
-    found = demo.latency(log(tmp_path / "log.csv", *ends), frames_of(8, lost=[5]), 0)
+    answer = LAST + 17_600 + 2 * FRAME_CYCLES - 1000    # of a ping, before the third frame's gaze
+    path = log(tmp_path / "log.csv", 10, sorted([answer, *packets_of(10)]))
+    found = demo.latency(path, frames_of(8, lost=[5]), 0, packets=2)
     assert found["frames"] == 4                 # not the third, the lost one, the one before it, the last
     assert found["last_sample_to_last_byte_max"] == pytest.approx(1.1)
 
 
+def test_latency_of_the_gaze_alone_has_one_packet_a_frame(tmp_path):
+    path = log(tmp_path / "log.csv", 9, packets_of(9)[::2])
+    assert demo.latency(path, frames_of(6), 0, packets=1)["last_sample_to_last_byte"] == pytest.approx(1.1)
+    with pytest.raises(SparsegazeError, match="no frame"):
+        demo.latency(path, frames_of(6), 0, packets=2)
+
+
 def test_latency_of_a_log_without_a_whole_frame_is_an_error_not_a_number(tmp_path):
-    for ends in ([], [5, 9], packets_of(1)[:1]):
+    for cycles, ends in ((0, []), (0, [5, 9]), (3, []), (3, packets_of(1)[:1])):
         with pytest.raises(SparsegazeError, match="no frame"):
-            demo.latency(log(tmp_path / "log.csv", *ends), frames_of(2), 0)
+            demo.latency(log(tmp_path / "log.csv", cycles, ends), frames_of(2), 0, packets=2)
 
 
 # main -------------------------------------------------------------------------------------------------------
