@@ -21,12 +21,12 @@ enum event {                        // of the word's high byte
     EVENT_AGAIN = 0x40,
     EVENT_LAST = 0x50,              // the same, but then `list_next` follows
     EVENT_WAIT = 0x60,              // the pause between frames
-    // One byte: DDRC, exactly RELEASE_LEAD_CYCLES after the match. A service follows at once, with its kind and its
-    // byte, or none.
+    // One byte: DDRC, exactly RELEASE_LEAD_CYCLES after the match. A service follows at once, with its kind
+    // and its byte, or none.
     EVENT_RELEASE = 0x80,
     EVENT_ALONE = 0x30,
-    // The same with four bytes: PORTC and PORTD at once, if lit; lead less LEAD_LESS_CYCLES; DDRC exactly lead
-    // after the match.
+    // The same with four bytes: PORTC and PORTD at once, if lit; lead less LEAD_LESS_CYCLES; DDRC exactly
+    // lead after the match.
     EVENT_SET_RELEASE = 0xC0,
 };
 

@@ -152,7 +152,8 @@ static void ask_supply(struct plan *plan, uint8_t of)
 // long.
 SELDOM static void try_supply(void)
 {
-    if (supply != SUPPLY_WANTED || sense_current != plan_next || sense_list_next != sense_plan[plan_next].event)
+    if (supply != SUPPLY_WANTED || sense_current != plan_next
+        || sense_list_next != sense_plan[plan_next].event)
         return;
     const uint8_t done = sense_done;
     const uint16_t since = ticks_now() - sense_base;
