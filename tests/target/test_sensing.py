@@ -215,7 +215,8 @@ def test_timing_changes_begin_a_frame_and_keep_every_exposure_exact(port_app):
         for c in cycles:
             frames.setdefault(c.seq, []).append(c.left)
         whole = list(frames.values())[1:-1]
-        assert all(left == list(range(took_timing.repeats))[::-1] for left in whole) and whole, (timing, frames)
+        countdown = list(range(took_timing.repeats))[::-1]
+        assert whole and all(left == countdown for left in whole), (timing, frames)
 
 
 @pytest.mark.parametrize("rate_hz", [1, 10, 100, 490])
