@@ -51,11 +51,12 @@ const struct sg_affine *app_recentre(void)
 SELDOM void app_recentre_set(const struct sg_affine *affine)
 {
     const struct sg_model_view *model = app_model();
-    app_live.model_crc = model ? model->crc : 0;
+    app_live.model_crc = model && affine ? model->crc : 0;
     memset(&app_live.recentre, 0, sizeof app_live.recentre);
     if (affine)
         app_live.recentre = *affine;
     dirty = 1;
+    app_rate_renew();
 }
 
 void app_live_changed(void)

@@ -10,11 +10,12 @@ enum app_rate_cost {
     COST_SENSE = 4250,          // interrupts of one sensing cycle; they send the gaze as well
     COST_FRAME = 3950,          // readings, features, exposure and health of one channel, the loop
     COST_MODEL = 2150,          // inference: with any model, and per vector, with the interrupts of that time
-    COST_VECTOR = 206,
+    COST_VECTOR = 210,
+    COST_RECENTRE = 640,        // a correction, if there is one
     COST_GAZE = 1030,           // its packet
     COST_RAW = 5800,            // and sending it
     COST_COUNTS = 7000,
-    COST_REQUEST = 450,          // a look at the line; a request makes a frame wait
+    COST_REQUEST = 400,          // a look at the line; a request makes a frame wait
 };
 
 // All of the following is in device microseconds, of 16 cycles, rounded so that nothing gets too short. A frame
@@ -67,6 +68,8 @@ SELDOM static uint16_t infer_us(void)
 SELDOM static uint16_t work_us(void)
 {
     uint16_t cycles = COST_SENSE + COST_FRAME + COST_REQUEST;
+    if (app_recentre())
+        cycles += COST_RECENTRE;
     if (app.stream & SG_STREAM_GAZE)
         cycles += COST_GAZE;
     if (app.stream & SG_STREAM_RAW)
