@@ -11,6 +11,8 @@ LATENCY_MEAN_MS, LATENCY_LAST_MS = 2.5, 1.5
 S2S_DEG, S2S_250_DEG, OVER_BOUND = 0.35, 0.18, 1.15
 RATIO = {"room": 1.1, "bright_room": 1.5, "sun_gap": 3.0}
 STEP_SATURATED, STEP_SETTLE = 5, 10
+# of report keys, in words, and whether the bar is judged at it
+SETTINGS = (("_250", "4 cycles a frame", "bar"), ("", "default setting", "aim"))
 VALID = 0.8  # what is left out may not be what is wrong
 FLICKER, IRRADIANCE_W_M2, SPARE = 1.2, 100.0, 0.10
 BITS_APART = 0.25  # closed form against Monte Carlo of 500 draws: 5 standard errors
@@ -57,9 +59,13 @@ def bars(report):
             most(f"error_ratio.{name}, default setting", report["error_ratio"][name], limit, "aim")
             least(f"valid frames, {name}, set to 4 cycles a frame", report["valid_250"][name], VALID)
             least(f"valid frames, {name}, default setting", report["valid"][name], VALID, "aim")
-            most(f"saturated frames after the first 5, {name}", report["saturated_after"][name], 0)
-        most("step.saturated_frames", report["step"]["saturated_frames"], STEP_SATURATED)
-        most("step.settle_frames", report["step"]["settle_frames"], STEP_SETTLE)
+            for key, setting, kind in SETTINGS:
+                saturated = report["saturated_after" + key][name]
+                most(f"saturated frames after the first 5, {name}, {setting}", saturated, 0, kind)
+        for key, setting, kind in SETTINGS:
+            step = report["step" + key]
+            most(f"step.saturated_frames, {setting}", step["saturated_frames"], STEP_SATURATED, kind)
+            most(f"step.settle_frames, {setting}", step["settle_frames"], STEP_SETTLE, kind)
         most("exposure_shift_deg over RMS-S2S", report["exposure_shift_over_s2s"], 1.0)
         most(
             "flicker_ratio_250, over steady light, set to 4 cycles a frame",

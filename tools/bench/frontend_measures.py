@@ -104,21 +104,27 @@ def flicker(board, repeats=1):
     return found
 
 
-def steps(board, repeats, rng, place=(4.0, -6.0)):
-    """Ambient steps of 1000:1 up and down, at moments that no exposure knows: dict of up and down."""
+def steps(board, repeats, rng, cycles=1, place=(4.0, -6.0)):
+    """Ambient steps of 1000:1 up and down, at moments that no exposure knows: dict of up and down.
+
+    cycles   of a frame
+    """
+    board.device.settings(repeats=cycles)
+    apart_s = STEP_S * (1 if cycles == 1 else cycles / 2)
     rest(board)
     board.look(*place)
     board.control.ambient(STEP_NA[0])
     board.frames(0.3)
     at, moment = [], board.now_us() + 50_000
     for k in range(2 * repeats):
-        moment += int(STEP_S * 1e6) + int(rng.integers(0, 2000))
+        moment += int(apart_s * 1e6) + int(rng.integers(0, 2000))
         at.append(moment)
         board.control.set_at(
             int(moment * CPU_MHZ) + int(rng.integers(0, 16)), "ambient_na", STEP_NA[(k + 1) % 2]
         )
-    frames = board.frames((at[-1] - board.now_us()) * 1e-6 + 2 * STEP_S)
+    frames = board.frames((at[-1] - board.now_us()) * 1e-6 + 2 * apart_s)
     rest(board)
+    board.device.settings(repeats=1)
     error = error_deg(frames, np.tile(place, (len(frames), 1)))
     begin = np.searchsorted(frames["t_us"] - board.offset_us, at)
     return {"up": judge_steps(frames, error, begin[0::2]), "down": judge_steps(frames, error, begin[1::2])}

@@ -23,7 +23,7 @@ from frontend_physics import P
 
 LIGHTS = ("nominal", "dim", "bright")
 SLOW_REPEATS = 4  # cycles a frame: 250 Hz
-STREAM_S, STEPS = 60.0, 60
+STREAM_S, STEPS = 60.0, 30
 QUICK_STREAM_S, QUICK_STEPS = 3.0, 8
 
 
@@ -80,7 +80,9 @@ def _nominal(board, row, quick, rng, folder):
     row["flicker"] = measures.flicker(board)
     row["flicker_250"] = measures.flicker(board, SLOW_REPEATS)
     row["shift"] = measures.exposure_shift(board)
-    row["step"] = measures.steps(board, QUICK_STEPS if quick else STEPS, rng)
+    count = QUICK_STEPS if quick else STEPS
+    row["step"] = measures.steps(board, count, rng)
+    row["step_250"] = measures.steps(board, count, rng, SLOW_REPEATS)
     row["stream"] = measures.stream(board, QUICK_STREAM_S if quick else STREAM_S, rng, folder / "frames.csv")
 
 
@@ -165,14 +167,14 @@ def worst(rows):
             out.setdefault(key, {})[name] = value
         for key, table in (("valid", "ambient"), ("valid_250", "ambient_250")):
             out.setdefault(key, {})[name] = min(row[table][name]["valid"] for row in rows)
-        out.setdefault("saturated_after", {})[name] = most(
-            lambda row, n=name: row["ambient"][n]["saturated_after"]
-            + row["ambient_250"][n]["saturated_after"]
-        )
-    out["step"] = {
-        key: most(lambda row, key=key: _larger(row["step"]["up"][key], row["step"]["down"][key]))
-        for key in ("saturated_frames", "settle_frames")
-    }
+        for key, table in (("saturated_after", "ambient"), ("saturated_after_250", "ambient_250")):
+            value = most(lambda row, t=table, n=name: row[t][n]["saturated_after"])
+            out.setdefault(key, {})[name] = value
+    for table in ("step", "step_250"):
+        out[table] = {
+            key: most(lambda row, t=table, k=key: _larger(row[t]["up"][k], row[t]["down"][k]))
+            for key in ("saturated_frames", "settle_frames")
+        }
     for key, table in (("flicker_ratio", "flicker"), ("flicker_ratio_250", "flicker_250")):
         out[key] = most(lambda row, t=table: flicker_ratio(row[t]))
     return out
