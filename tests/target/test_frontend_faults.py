@@ -53,7 +53,7 @@ def named(status):
 @pytest.mark.parametrize("channel", range(6))
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_a_faulty_led_is_named_flagged_and_never_a_wild_gaze(worn, kind, channel):
-    """No gaze from the frame in which it happens, named once the eye has looked about; then as before."""
+    """No gaze from the frame in which it happens, named within 3 s, the eye looking about; then as before."""
     one = worn()
     one.device.set_stream(gaze=True)
     one.control.fault(channel, kind)
@@ -63,10 +63,11 @@ def test_a_faulty_led_is_named_flagged_and_never_a_wild_gaze(worn, kind, channel
         one.look(place)
         frames = one.run(0.25)
         one.never_wild(frames, f"looking at {place}")
+    one.settle(1.5)         # saturated frames cost most: health is looked at seldom then
     found = named(one.device.status())
     print(f"{kind} of {channel}: status names {found}")
     assert found[channel] & KINDS[kind]
-    late = flags(frames[len(frames) * 3 // 4:])
+    late = flags(one.run(0.1))
     assert (late & lib.SG_FLAG_FAULT).all() and not (late & lib.SG_FLAG_VALID).any()
     one.control.fault(channel, "none")
     one.never_wild(one.run(0.3), "mended")
