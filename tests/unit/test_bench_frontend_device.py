@@ -264,5 +264,5 @@ def test_size_counts_what_is_flashed(bench, firmware_elf):
     flashed = sum(int(row[1:3], 16) for row in rows if row[7:9] == "00")
     found = bench.size.size(firmware_elf)
     assert found["flash"]["bytes"] == pytest.approx(flashed, abs=2)
-    assert found["flash"]["spare"] == pytest.approx(1 - (flashed + 4096 + 512) / 32768, abs=1e-3)
+    assert found["flash"]["spare"] == pytest.approx(1 - (flashed + 3072 + 512) / 32768, abs=1e-3)
     assert 0 < found["ram"]["bytes"] < 2048

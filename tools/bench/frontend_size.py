@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parents[2]
 ELF = ROOT / "build" / "firmware" / "firmware.elf"
 HEADSET = ROOT / "headsets" / "led2gaze.toml"
 FLASH_BYTES, RAM_BYTES = 32768, 2048
-SLOTS_BYTES, BOOTLOADER_BYTES = 2 * 2048, 512  # two models, Optiboot: taken as well
+SLOTS_BYTES, BOOTLOADER_BYTES = 2 * 1536, 512  # two models, Optiboot: taken as well
 SPARE = 0.10
 
 
