@@ -12,13 +12,13 @@ enum {
     // out of range a gaze may look right and be wrong.
     RECOVERY_US = 31000,
     // A frame's work may end so much later than one period after its last sample for a request still to fit before
-    // readings are lost: the costliest takes 500 us.
-    BEHIND_US = 200,
+    // readings are lost: the costliest takes 600 us, with what it sends.
+    BEHIND_US = 120,
     // What comes after the gaze takes about so much longer than the readings were on their way.
     AFTER_GAZE_US = 40,
     CATCH_UP_CYCLES = 8,
     // Whatever happens, a request is heard after so many cycles.
-    PATIENCE_CYCLES = 64,
+    PATIENCE_CYCLES = 40,
 };
 
 struct app_state app;

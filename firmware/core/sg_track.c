@@ -19,16 +19,11 @@ _Static_assert((int)SG_HEALTH_OPEN == (int)SG_FAULT_OPEN && (int)SG_HEALTH_SHORT
 _Static_assert((int)SG_EXPOSE_SATURATED_CODE == (int)SG_LIGHT_SATURATED_CODE
                && (int)SG_HEALTH_FULL_CODE == (int)SG_LIGHT_SATURATED_CODE, "one idea of full");
 
-// One row of G g, Q7, rounded: at most 2^14. Q9 times Q7 is Q16, high and low byte of the angle apart, as the
-// AVR multiplies: floor((256 a + b) / 512) is floor((a + floor(b / 256)) / 2).
+// One row of G g, Q7, rounded: at most 2^14 in size. Q9 times Q7 is Q16, at most 2^22.
 static int16_t gained(const int8_t row_q9[2], const int16_t deg_q7[2])
 {
-    int32_t high_q8 = 0, low_q16 = 256;
-    for (uint8_t i = 0; i < 2; i++) {
-        high_q8 += (int16_t)(row_q9[i] * (int8_t)(deg_q7[i] >> 8));
-        low_q16 += (int16_t)(row_q9[i] * (uint8_t)deg_q7[i]);
-    }
-    return (int16_t)((high_q8 + (low_q16 >> 8)) >> 1);
+    const int32_t sum_q16 = (int32_t)row_q9[0] * deg_q7[0] + (int32_t)row_q9[1] * deg_q7[1] + 256;
+    return (int16_t)(sum_q16 >> 9);
 }
 
 // In place. Returns 0 if an angle saturated.
