@@ -39,6 +39,7 @@ GOOD = {
     },
     "inference": {"cycles": 15900.0},
     "frame": {"cycles": 22700.0, "period_cycles": 24984.0},
+    "fast": {"n_vectors": 18, "rate_hz": 1001.0, "limit_hz": 1001, "lost": 0, "late": 0},
     "latency_ms": {
         "mean_sample_to_last_byte": 2.1,
         "mean_sample_to_last_byte_max": 2.2,

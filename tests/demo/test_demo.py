@@ -25,7 +25,8 @@ stream.seconds stream.rate_hz stream.frames stream.lost stream.bit_identical
 accuracy.mean_deg accuracy.median_deg accuracy.p95_deg accuracy.accuracy_deg accuracy.rms_s2s_deg
 accuracy.data_loss accuracy.to_true_gaze_mean_deg
 accuracy.gp64_mean_deg inference.cycles frame.cycles latency_ms.mean_sample_to_last_byte
-latency_ms.with_features.last_sample_to_last_byte
+full.with_features_ms.last_sample_to_last_byte full.latency_ms.mean_sample_to_last_byte
+fast.n_vectors fast.rate_hz fast.lost
 latency_ms.last_sample_to_last_byte stream.limit_hz
 """.split()
 
@@ -53,8 +54,10 @@ def test_a_good_report_meets_every_bar(good):
         ("stream.lost", 1, "stream.lost"),
         ("stream.torn", 1, "stream.lost"),
         ("stream.bit_identical", False, "stream.bit_identical"),
-        ("latency_ms.mean_sample_to_last_byte", 2.51, "latency, mean sample to last byte"),
-        ("latency_ms.last_sample_to_last_byte", 1.51, "latency, last sample to last byte"),
+        ("fast.rate_hz", 999.9, "fast.rate_hz"),
+        ("fast.lost", 1, "fast.lost"),
+        ("latency_ms.mean_sample_to_last_byte", 2.51, "fast.latency, mean sample to last byte"),
+        ("latency_ms.last_sample_to_last_byte", 1.51, "fast.latency, last sample to last byte"),
         ("accuracy.data_loss", 0.21, "accuracy.data_loss"),
         ("accuracy.gp64_mean_deg", 0.64, "|mean_deg - gp64_mean_deg|"),
         ("accuracy.gp64_mean_deg", 0.76, "|mean_deg - gp64_mean_deg|"),
@@ -120,7 +123,7 @@ def frames_of(n, offset_us=0, lost=()):
 
 
 def packets_of(n, late=()):
-    """Ends of the gaze's packet 1.1 ms after the last sample, 0.01 more in `late`; the features' 0.4 later."""
+    """Ends of the gaze's packet 1.1 ms after the last sample, 0.01 more in `late`; the features 0.4 later."""
     ends = []
     for i in range(n):
         gaze = LAST + 17_600 + FRAME_CYCLES * i + (160 if i in late else 0)
