@@ -37,8 +37,8 @@ FRESH_S, READY_S = 600.0, 240.0     # bars: whole run on a fresh clone, and when
 LOSS_MOST = 0.2                     # bar: blinks alone cost about 0.09 (15 a minute, 0.24 s and the hold after each)
 TARGETS, HELD_OUT = 120, 25
 ALONE_S, SETTLE_S = 4.0, 1.0        # of the gaze stream alone, for rate and latency
-RESULTS = ("report.json", "demo.png", "map.png", "gaze.csv", "latency.csv", "latency_64.csv", "latency_features.csv", "recording.csv",
-           "model.sgm")
+RESULTS = ("report.json", "demo.png", "map.png", "gaze.csv", "latency.csv", "latency_64.csv", "latency_features.csv",
+           "recording.csv", "model.sgm")
 SECTION_INFER, SECTION_FRAME = "0", "5"     # GPIOR0 sections of the firmware: inference, and all work on a frame
 
 # The demo's bars are about a full model; left alone, calibrate takes the fewest vectors that do, some 25. A thousand

@@ -25,7 +25,7 @@ def tool(monkeypatch, tmp_path, good):
 def test_table_shows_the_figures_of_the_report(good):
     table = module.table(good)
     assert "simulated person 1" in table and "**0.70** / 0.60 / 1.50 deg" in table
-    for figure in ("640.4 Hz", "16010, 0, 0", "64 vectors", "15,900, 22,700 of 24,984 cycles"):
+    for figure in ("640.4 Hz", "18 vectors, gaze alone", "1001.0 Hz; 0", "16010, 0, 0", "64 vectors", "15,900, 22,700 of 24,984 cycles"):
         assert figure in table
     assert "2.10 ms, 1.25 ms" in table
     assert {line.count("|") for line in table.splitlines()} == {4}
