@@ -11,6 +11,7 @@ enum {
     // A blink leaves the calibrated range before the lids are where they were: this long after the last frame
     // out of range a gaze may look right and be wrong.
     RECOVERY_US = 31000,
+    BLINK_US = 3900,                    // out of range for so long
     // A frame's work may end so much later than one period after its last sample for a request still to fit before
     // readings are lost: the costliest takes 600 us, with what it sends.
     BEHIND_US = 120,
@@ -44,6 +45,8 @@ static uint8_t skipped;                 // cycles without a look at exposures an
 static uint16_t previous_exposure[HAL_CHANNELS];
 static uint32_t out_us;                 // when the last frame out of range was sensed
 static uint8_t recovering;
+static uint8_t out_before;              // the frame before was out of range
+static uint16_t since_us;               // and since then
 
 void app_count(uint16_t *counter)
 {
@@ -188,8 +191,16 @@ static void finish_frame(const struct hal_cycle *cycle)
     // Where an exposure follows the light, features say nothing about the lids.
     if ((out->gaze.flags & SG_FLAG_OUT_OF_RANGE)
         && !(flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_EXPOSURE))) {
-        out_us = t_us;
-        recovering = 1;
+        // Lids stay away for long; noise does not, nor does it reach means of several cycles.
+        if (!out_before)
+            since_us = (uint16_t)t_us;
+        if (app.pause || app_timing()->repeats > 1 || (uint16_t)((uint16_t)t_us - since_us) >= BLINK_US) {
+            out_us = t_us;
+            recovering = 1;
+        }
+        out_before = 1;
+    } else {
+        out_before = 0;
     }
 
     HAL_BEGIN(HAL_SECTION_OUTPUT);

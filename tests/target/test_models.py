@@ -109,9 +109,13 @@ def test_frames_within_31_ms_after_one_out_of_range_are_recovering_and_not_valid
     out = [bool(frame.gaze.flags & lib.SG_FLAG_OUT_OF_RANGE) for frame in frames]
     last = max(k for k, is_out in enumerate(out) if is_out)
     assert sum(out) > 20 and last < 100
+    moving = lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_EXPOSURE
+    held, since = [], None              # frames that start the hold: out of range for 3.9 ms, in settled light
+    for frame, was_out in zip(frames, out):
+        since = None if not was_out or frame.raw.flags & moving else frame.t_us if since is None else since
+        held.append(since is not None and (rate_hz != 0 or frame.t_us - since >= 3900))
     for k, frame in enumerate(frames):
-        recovering = any(was_out and frame.t_us - before.t_us <= 31_000
-                         for was_out, before in zip(out[:k], frames[:k]))
+        recovering = any(holds and frame.t_us - before.t_us <= 31_000 for holds, before in zip(held[:k], frames[:k]))
         assert bool(frame.raw.flags & lib.SG_FLAG_RECOVERING) == recovering
         assert bool(frame.gaze.flags & lib.SG_FLAG_RECOVERING) == recovering
         refused = recovering or out[k] or frame.raw.flags & (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED

@@ -313,7 +313,7 @@ def test_a_model_too_large_for_a_slot_is_one_line():
     class Large:
         channels, image, crc = 6, bytes(4000), 0
 
-    with pytest.raises(ModelError, match="4000 bytes does not fit the target's slot of 3072") as caught:
+    with pytest.raises(ModelError, match="4000 bytes does not fit the target's slot of 1536") as caught:
         predict(Large(), random_features(3), "nano")
     assert "\n" not in str(caught.value) and "vectors" in caught.value.remedy
 
