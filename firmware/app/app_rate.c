@@ -13,8 +13,8 @@ enum app_rate_cost {
     COST_VECTOR = 210,
     COST_RECENTRE = 640,        // a correction, if there is one
     COST_GAZE = 1030,           // its packet
-    COST_RAW = 5800,            // and sending it
-    COST_COUNTS = 7000,
+    COST_RAW = 6500,            // and sending it
+    COST_COUNTS = 8500,
     COST_REQUEST = 400,          // a look at the line; a request makes a frame wait
 };
 
