@@ -38,6 +38,7 @@ static uint8_t left;                    // cycles still to come
 static uint8_t under_way;
 static uint16_t last_us;                // of the last sample
 static uint8_t behind;                  // the last gaze was late
+static uint8_t blinded;                 // the last frame was saturated or starved
 static uint8_t refused;                 // a byte came and found no time
 static uint8_t waited;                  // cycles that it has waited
 static uint8_t skipped;                 // cycles without a look at exposures and health
@@ -173,6 +174,7 @@ static void finish_frame(const struct hal_cycle *cycle)
     HAL_BEGIN(HAL_SECTION_FEATURE);
     uint8_t flags = sg_light_features(&app.light, app.feature);
     HAL_END(HAL_SECTION_FEATURE);
+    blinded = flags;
     if (flags)
         count_readings();
     flags |= exposures_changed(&cycle->reading);
@@ -254,8 +256,9 @@ void app_on_cycle(const struct hal_cycle *cycle)
             finish_frame(cycle);
         else if (last && app.stream)
             app_count(&app.status.tx_dropped);
-        // One that is behind catches up at the cost of its looks at exposures and health.
-        if (behind && skipped < CATCH_UP_CYCLES) {
+        // One that is behind catches up at the cost of its looks at exposures and health; not while exposures
+        // are what is wrong.
+        if (behind && !blinded && skipped < CATCH_UP_CYCLES) {
             skipped++;
         } else {
             skipped = 0;
