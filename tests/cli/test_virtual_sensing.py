@@ -79,9 +79,9 @@ def test_swapped_leds_are_named_by_either_reference(command, nano, kept, one, ot
         nano.control.swap(one, other)
 
 
-@pytest.mark.parametrize("kind, word", [("open", "sensor 3 is open"), ("short", "sensor 3 is shorted")])
+@pytest.mark.parametrize("kind, word", [("open", "sensor 1 is open"), ("short", "sensor 1 is shorted")])
 def test_a_broken_led_is_named_and_linearity_refuses_by_it(command, nano, kind, word):
-    nano.control.fault(3, kind)
+    nano.control.fault(1, kind)
     try:
         for name in ("status", "doctor", "probe"):
             code, out, _ = command(name, nano.port)
@@ -89,7 +89,7 @@ def test_a_broken_led_is_named_and_linearity_refuses_by_it(command, nano, kind, 
         code, _, err = command("linearity", nano.port)
         assert code == 1 and word in err
     finally:
-        nano.control.fault(3, "none")
+        nano.control.fault(1, "none")
 
 
 def test_a_supply_that_sags_is_named_with_its_voltage(command, virtual_nano, firmware_hex):
