@@ -137,9 +137,11 @@ def exchange(device, data, wait_s=0.05):
 
 
 def collect(device, n, timeout_s=2.0):
-    """The next n stream frames."""
-    frames = []
+    """The next n stream frames, from the first whole one on: a stream may begin in the middle of a frame's packets."""
+    frames, parts = [], bin(device._stream_bits).count("1")
     for frame in device.frames(timeout_s):
+        if not frames and parts > sum(part is not None for part in (frame.raw, frame.gaze, frame.counts)):
+            continue
         frames.append(frame)
         if len(frames) == n:
             return frames
