@@ -15,7 +15,7 @@ enum app_rate_cost {
     COST_GAZE = 1030,           // its packet
     COST_RAW = 6500,            // and sending it
     COST_COUNTS = 8500,
-    COST_REQUEST = 400,          // a look at the line; a request makes a frame wait
+    COST_REQUEST = 1400,         // a look at the line; a request makes a frame wait
 };
 
 // All of the following is in device microseconds, of 16 cycles, rounded so that nothing gets too short. A frame

@@ -139,6 +139,18 @@ def test_latency_is_read_off_the_log_of_pins_and_bytes(bench, tmp_path):
     assert found["latency_mean_max_ms"] == pytest.approx((span + 9_016) / 16_000)
 
 
+def test_latency_beyond_a_frames_time_is_not_taken_for_the_frame_befores(bench, tmp_path):
+    rows = []
+    for k in range(40):
+        one, _ = cycle_log(20_000 + 16_000 * k)
+        rows += one + [("delimiter", max(cycle for event, cycle in one if event.startswith("adc")) + 20_000)]
+    rows.sort(key=lambda row: row[1])
+    path = tmp_path / "frames.csv"
+    path.write_text("event,cycle\n" + "".join(f"{event},{cycle}\n" for event, cycle in rows))
+    assert bench.latency.latency(path, 900)["latency_last_ms"] == pytest.approx(1.25)
+    assert bench.latency.latency(path)["latency_last_ms"] == pytest.approx(0.25)
+
+
 @pytest.mark.parametrize("cut", range(0, 60, 7))
 def test_a_log_that_begins_within_a_cycle_is_read_from_the_next_one_on(bench, cut):
     rows = [row for k in range(4) for row in cycle_log(20_000 + 16_000 * k)[0]]

@@ -44,6 +44,7 @@ DWELL_S, SKIP_S = (
 LEAD_US = 20_000
 FRAME = np.dtype(
     [("seq", "i8"), ("t_us", "i8"), ("gaze_deg", "f8", (2,)), ("flags", "u1"), ("features", "u2", (6,))]
+    + [("infer_us", "u2")]
 )
 
 
@@ -101,10 +102,15 @@ class Board:
             found, features = frame.gaze, frame.raw.feature if frame.raw else (0,) * 6
             place = (found.azimuth_deg, found.elevation_deg) if found else (np.nan, np.nan)
             flags = (found or frame.raw).flags
-            rows.append((frame.seq, frame.t_us, place, flags, tuple(features)))
+            infer_us = found.infer_us if found else 0
+            rows.append((frame.seq, frame.t_us, place, flags, tuple(features), infer_us))
             if frame.t_us - begin >= seconds * 1e6:
                 return np.array(rows, FRAME)
         return np.array(rows, FRAME)
+
+    def resume(self):
+        """The streams have been switched off behind our back."""
+        self._streams = None
 
     def look(self, azimuth_deg, elevation_deg):
         """One target, from now on."""

@@ -56,15 +56,18 @@ def cycles_of(rows):
     return np.array(mean), np.array(last), np.array(sent)
 
 
-def latency(path):
+def latency(path, infer_us=0):
     """Milliseconds of device time from mean and last sample to the last byte of the gaze, mean and
     maximum; and how evenly the last samples follow each other.
 
+    infer_us   the least of what the device says lay between a frame's last sample and its inference: the
+               packet of the frame before may end after the last sample too, but before that
     Of frames after which just one packet was sent before the next was due: answers to pings are left out.
     """
     mean, last, sent = cycles_of(read(path))
-    first = np.searchsorted(sent, last[:-1], side="right")
-    alone = np.searchsorted(sent, last[1:], side="right") - first == 1
+    ready = last + infer_us * CYCLES_PER_MS / 1000
+    first = np.searchsorted(sent, ready[:-1], side="right")
+    alone = np.searchsorted(sent, ready[1:], side="right") - first == 1
     if not alone.any():
         raise SparsegazeError(
             "no frame in the virtual Nano's log whose bytes can be told apart", "run it longer"

@@ -199,15 +199,20 @@ def stream(board, seconds, rng, log=None):
     control.targets_clear()
     for k, (azimuth, elevation) in enumerate(rng.uniform(-18, 18, (int(seconds) + 1, 2))):
         control.target(board.now_us() + k * 1_000_000, azimuth, elevation)
-    before = device.status()
     frames = board.frames(0.2)
+    device.set_stream()  # a request may delay the frame it comes in: none while the frames count
+    before = device.status()
+    board.resume()
+    board.frames(0.1)
     lost = device.lost
     if log:
         control.frames(log)
     frames = board.frames(seconds)
     if log:
         control.frames(None)
+    device.set_stream()
     after = device.status()
+    board.resume()
     period = np.diff(frames["t_us"])
     numbered = int(frames["seq"][-1] - frames["seq"][0]) + 1
     board.still()
@@ -223,7 +228,7 @@ def stream(board, seconds, rng, log=None):
         "saturated": _grown(before, after, "saturated"),
         "starved": _grown(before, after, "starved"),
         "exposure_changes": _grown(before, after, "exposure_changes"),
-        "latency": latency(log) if log else None,
+        "latency": latency(log, int(frames["infer_us"].min())) if log else None,
     }
 
 

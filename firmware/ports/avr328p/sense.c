@@ -56,6 +56,7 @@ static uint16_t exposure[HAL_CHANNELS];     // asked for, clipped
 static uint16_t slot;                       // of `timing`
 static __uint24 pause_new;
 static uint8_t timing_new, plan_new;        // asked for and not in a plan yet
+static uint8_t plan_urgent;             // an exposure falls by half: too much light, nothing waits for turns
 static uint8_t written;                     // lists of the next plan
 static uint8_t locked_out;
 uint8_t sense_took;                         // cycles taken, low byte
@@ -268,6 +269,9 @@ uint16_t hal_exposure_most(uint8_t channel)
 void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS])
 {
     plan_clip(exposure_cycles, timing.wiring, slot);
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+        if (exposure_cycles[i] < exposure[i] >> 1)
+            plan_urgent = 1;
     memcpy(exposure, exposure_cycles, sizeof exposure);
     plan_new = 1;
 }
@@ -320,6 +324,7 @@ SELDOM static void write_plan(void)
     if (++written != 3)
         return;
     written = 0;
+    plan_urgent = 0;
     if (shown_plan == index)
         shown_plan = NONE;
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
@@ -344,7 +349,9 @@ void sense_poll(void)
     }
     // The other plan is free when neither the running cycle nor the newest complete one follows it.
     if ((plan_new || written) && sense_current == plan_next && filling()->other->plan == plan_next)
-        write_plan();
+        do {
+            write_plan();
+        } while (plan_urgent && written);
     try_supply();
 }
 
