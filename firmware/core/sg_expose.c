@@ -12,6 +12,7 @@ enum {
     CAUTION_MOST = 6,
     ACQUIRED_A_CYCLE = 2,
     LEAST_MOST = 1024,          // a port that takes more instead has other reasons
+    SETTLED_LOOKS = 4,
     SOON_LOOKS = 5,             // 30 ms: a crest comes within 10 ms
     WATCH_LOOKS = 5,            // 30 ms: five phases of a period of 10 ms
     SLOW_ROUNDS = 170,          // 1 s at 6 ms a round
@@ -205,10 +206,9 @@ static uint8_t at_once(struct sg_expose *expose, const uint16_t lit_code[6], con
     for (uint8_t i = 0; i < CHANNELS; i++, led++) {
         const uint16_t lit = lit_code[i], unlit = unlit_code[i];
         // Two full without our light: so much of it came that the others will be, and all change at once.
-        if (drowned >= 2 && exposure_cycles[i] == led->exposure_cycles && led->stage != SG_EXPOSE_WATCH) {
-            const uint16_t now = within(led, exposure_cycles[i] >> 4);
-            if (now < led->exposure_cycles)
-                changed |= change(led, now, SG_EXPOSE_ACQUIRE);
+        if (drowned >= 2 && exposure_cycles[i] == led->exposure_cycles && led->stage == SG_EXPOSE_TRACK
+            && led->age >= SETTLED_LOOKS) {
+            changed |= full(led, SG_EXPOSE_SATURATED_CODE, exposure_cycles[i]);
         } else if (is_full(lit, unlit)) {
             changed |= full(led, unlit, exposure_cycles[i]);
         } else if (led->stage <= SG_EXPOSE_REFINE && acquired < ACQUIRED_A_CYCLE
