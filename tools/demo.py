@@ -43,7 +43,7 @@ SECTION_INFER, SECTION_FRAME = "0", "5"     # GPIOR0 sections of the firmware: i
 
 # The demo's bars are about a full model; left alone, calibrate takes the fewest vectors that do, some 25. A thousand
 # gazes a second, and the latency that goes with them, are for as many as fit into a millisecond.
-VECTORS, FAST_VECTORS = 64, 18
+VECTORS, FAST_VECTORS = 64, 15
 
 
 def main():

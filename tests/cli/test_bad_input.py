@@ -206,7 +206,7 @@ def too_large(path):
     from intelhex import IntelHex
 
     image = IntelHex()
-    image.frombytes(bytes(0x6001))
+    image.frombytes(bytes(0x6C01))
     image.write_hex_file(str(path))
 
 
