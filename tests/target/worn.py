@@ -10,7 +10,7 @@ from sparsegaze.virtual import VirtualNano
 from sparsegaze.wire import lib
 
 PERSON = 1              # of headsets/led2gaze.toml: its response map is computed once and kept
-TARGETS, VECTORS = 50, 18
+TARGETS, VECTORS = 50, 15
 CYCLES_PER_US = 16
 WILD_DEG = 5.0          # off the truth while called valid: no error of a calibration reaches that
 GOOD_DEG = 1.5          # mean, of a calibration on so few targets
