@@ -16,8 +16,6 @@ enum {
     // readings are lost: the costliest takes 600 us, with what it sends.
     BEHIND_US = 120,
     // What comes after the gaze takes about so much longer than the readings were on their way.
-    AFTER_GAZE_US = 40,
-    CATCH_UP_CYCLES = 8,
     // Whatever happens, a request is heard after so many cycles.
     PATIENCE_CYCLES = 40,
 };
@@ -37,11 +35,8 @@ static uint16_t frame_seq;
 static uint8_t left;                    // cycles still to come
 static uint8_t under_way;
 static uint16_t last_us;                // of the last sample
-static uint8_t behind;                  // the last gaze was late
-static uint8_t blinded;                 // the last frame was saturated or starved
 static uint8_t refused;                 // a byte came and found no time
 static uint8_t waited;                  // cycles that it has waited
-static uint8_t skipped;                 // cycles without a look at exposures and health
 
 static uint16_t previous_exposure[HAL_CHANNELS];
 static uint32_t out_us;                 // when the last frame out of range was sensed
@@ -174,7 +169,6 @@ static void finish_frame(const struct hal_cycle *cycle)
     HAL_BEGIN(HAL_SECTION_FEATURE);
     uint8_t flags = sg_light_features(&app.light, app.feature);
     HAL_END(HAL_SECTION_FEATURE);
-    blinded = flags;
     if (flags)
         count_readings();
     flags |= exposures_changed(&cycle->reading);
@@ -209,7 +203,6 @@ static void finish_frame(const struct hal_cycle *cycle)
     if (app.stream & SG_STREAM_GAZE) {
         out->gaze.t_us = t_us;
         out->gaze.infer_us = hal_now_us16() - (uint16_t)t_us - span_us;
-        behind = out->gaze.infer_us > app.period_us - AFTER_GAZE_US;
         send_stream(SG_MSG_GAZE, &out->gaze, sizeof out->gaze);
     }
     if (app.stream & SG_STREAM_RAW) {
@@ -256,14 +249,7 @@ void app_on_cycle(const struct hal_cycle *cycle)
             finish_frame(cycle);
         else if (last && app.stream)
             app_count(&app.status.tx_dropped);
-        // One that is behind catches up at the cost of its looks at exposures and health; not while exposures
-        // are what is wrong.
-        if (behind && !blinded && skipped < CATCH_UP_CYCLES) {
-            skipped++;
-        } else {
-            skipped = 0;
-            app_sense_cycle(cycle);
-        }
+        app_sense_cycle(cycle);
     }
     app_live_cycle(cycle->t_us);
     last_us = (uint16_t)cycle->t_us + cycle->span_us;

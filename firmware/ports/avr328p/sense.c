@@ -56,7 +56,7 @@ static uint16_t exposure[HAL_CHANNELS];     // asked for, clipped
 static uint16_t slot;                       // of `timing`
 static __uint24 pause_new;
 static uint8_t timing_new, plan_new;        // asked for and not in a plan yet
-static uint8_t plan_urgent;             // an exposure falls by half: too much light, nothing waits for turns
+static uint8_t plan_urgent;             // an exposure halves or doubles: the light is another, nothing waits for turns
 static uint8_t written;                     // lists of the next plan
 static uint8_t locked_out;
 uint8_t sense_took;                         // cycles taken, low byte
@@ -270,7 +270,7 @@ void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS])
 {
     plan_clip(exposure_cycles, timing.wiring, slot);
     for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        if (exposure_cycles[i] < exposure[i] >> 1)
+        if (exposure_cycles[i] < exposure[i] >> 1 || exposure_cycles[i] >> 1 > exposure[i])
             plan_urgent = 1;
     memcpy(exposure, exposure_cycles, sizeof exposure);
     plan_new = 1;
