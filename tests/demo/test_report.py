@@ -73,3 +73,11 @@ def test_the_simulators_table_shows_every_bar_and_whether_it_was_met(monkeypatch
     assert "| times ours | 2,346 | aim >= 10000 | **no** |" in text
     assert "| a response of that map, microseconds | 31.7 |" in text
     assert "left alone" in text
+
+
+def test_what_was_not_measured_is_no_zero_in_the_inference_table():
+    lids = dict.fromkeys(("shut_flagged", "half_flagged", "narrow_flagged", "false_alarms"), 0.5)
+    known = dict(coverage68=0.7, coverage95=None, **lids)
+    row = next(line for line in module.inference_table({"bars": [], "variance": known}).splitlines() if "to the target" in line)
+    assert "| 0.700, - |" in row
+    assert "0.000" not in module.inference_table({"bars": [], "variance": dict(coverage68=None, coverage95=None, **lids)})
