@@ -172,7 +172,7 @@ def test_a_model_whose_weights_fit_no_format_is_refitted_with_more_ridge(monkeyp
 
 
 def test_equal_centres_are_no_reason_to_fail():
-    from test_distil import problem
+    from test_expansion import problem
 
     start = Expansion(problem(np.random.default_rng(0)), np.full(4, 2.0), np.zeros((5, 4)))
     better = start.improved(10)
