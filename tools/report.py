@@ -76,9 +76,9 @@ def inference_table(report):
     variance = report.get("variance")
     if variance:
         for name, key in (("target", ""), ("true gaze", "truth_")):
-            inside = [variance.get(f"{key}coverage{part}") or 0.0 for part in (68, 95)]
-            lines.append(f"| errors to the {name} inside one sigma, inside 1.96 (0.683 and 0.95 of a Gaussian) | "
-                         f"{inside[0]:.3f}, {inside[1]:.3f} | - | - |")
+            inside = [variance.get(f"{key}coverage{part}") for part in (68, 95)]    # None: no sigma, nothing measured
+            inside = ", ".join("-" if part is None else f"{part:.3f}" for part in inside)
+            lines.append(f"| errors to the {name} inside one sigma, inside 1.96 (0.683 and 0.95 of a Gaussian) | {inside} | - | - |")
         lines.append(f"| frames with shut, half-shut, narrowed lids flagged; false alarms | {variance['shut_flagged']:.3f}, "
                      f"{variance['half_flagged']:.3f}, {variance['narrow_flagged']:.3f}; {variance['false_alarms']:.3f} | - | - |")
     defaults = [row for row in report.get("default", []) if row["dataset"].startswith("sim-")]

@@ -83,3 +83,11 @@ def test_the_front_ends_table_has_a_row_for_every_bar_and_marks_what_is_missed()
     assert len(table) == 2 + len(bars) and "2000 to 2004" in table[0]
     assert table[2] == "| \\* rate_hz | 1,001 | bar >= 1000 | yes |"
     assert table[3].endswith("| 24 | aim >= 64 | **no** |") and "| - |" in table[4]
+
+
+def test_what_was_not_measured_is_no_zero_in_the_inference_table():
+    lids = dict.fromkeys(("shut_flagged", "half_flagged", "narrow_flagged", "false_alarms"), 0.5)
+    known = dict(coverage68=0.7, coverage95=None, **lids)
+    row = next(line for line in module.inference_table({"bars": [], "variance": known}).splitlines() if "to the target" in line)
+    assert "| 0.700, - |" in row
+    assert "0.000" not in module.inference_table({"bars": [], "variance": dict(coverage68=None, coverage95=None, **lids)})

@@ -344,3 +344,32 @@ def test_the_full_process_is_near_the_truth_in_the_report(report):
     assert 0.05 < row["gp64_truth_mean_deg"] < 0.25  # noise-limited, as the description's constants make it
     assert row["gp64_truth_mean_deg"] < row["truth_mean_deg"] < 3.0
     assert 0.5 < row["plain_gp64_truth_mean_deg"] / row["gp64_truth_mean_deg"] < 2.0
+
+
+# -- what is kept of earlier runs ----------------------------------------------------------------------------
+
+
+def test_peers_are_measured_again_when_the_rows_they_may_train_on_change(bench, monkeypatch, tmp_path):
+    """And only then: the rows that the full process was given are part of the key, and are handed on."""
+    seen = []
+
+    def measure(name, calibration, held_out, truth_deg, gp_deg, workdir, say, spread):
+        seen.append(spread)
+        return [{"cycles": 1, "dataset": name}]
+
+    rows = SimpleNamespace(features=np.zeros((4, 6)), target_deg=np.zeros((4, 2)), valid=np.ones(4, bool))
+    rows.select = lambda chosen: rows
+    data = SimpleNamespace(name="x", key={"hash": "h"}, calibration=rows, held_out=rows,
+                           truth={"held_out_gaze_deg": np.zeros((4, 2))})
+    monkeypatch.setitem(sys.modules, "inference_peers", SimpleNamespace(measure=measure, __file__=__file__))
+    monkeypatch.setattr(bench.data.DataSet, "load", lambda place: data)
+    monkeypatch.setattr(bench.judge, "shared_rows", lambda data: np.arange(4))
+    monkeypatch.setattr(bench.judge, "against_peers", lambda rows, found: {"peers": found})
+    piece = {"gp_deg": np.zeros((4, 2)), "spread": (np.zeros((3, 6)), np.zeros((3, 2)))}
+    monkeypatch.setattr(bench.run, "fitted", lambda *words: piece)
+    (tmp_path / "peers").mkdir()
+    for expected in (1, 1):
+        bench.run.peers([tmp_path], [], print)
+        assert len(seen) == expected
+    piece["spread"] = np.ones((3, 6)), np.zeros((3, 2))
+    assert bench.run.peers([tmp_path], [], print)["peers"] and len(seen) == 2 and seen[1] is piece["spread"]

@@ -235,7 +235,8 @@ def peers(folders, rows, say):
             truth,
             piece["gp_deg"][shared],
         )
-        key = inference_data.file_hash(code, data.key["hash"], len(shared), piece["gp_deg"].tobytes())
+        more = [part.tobytes() for part in piece["spread"]]
+        key = inference_data.file_hash(code, data.key["hash"], len(shared), piece["gp_deg"].tobytes(), more)
         measure = partial(inference_peers.measure, data.name, *given, place / "peers", say, piece["spread"])
         made = kept(place / "peers.pickle", key, measure)
         if not any(one["cycles"] for one in made):  # nothing ran: they may be installed by the next time

@@ -61,10 +61,10 @@ def sources_of(module):
 
 
 def fitted(folder, data, n_vectors):
-    """{image, gp_deg, gp_std, spread, report, seconds} of a data set's fit to so many vectors.
+    """{image, gp_deg, gp_std, noise_deg, spread, seconds} of a data set's fit to so many vectors.
 
-    gp_deg [n, 2] and gp_std [n]: the float64 process at every held-out row; spread (features, gaze_deg): the rows
-    that it was given, moved frames among them. gp_std and spread at DEFAULT_N only.
+    gp_deg [n, 2] and gp_std [n]: the float64 process at every held-out row, and its noise_deg; spread (features
+    [k, d], gaze_deg [k, 2]): the rows that it was given, moved frames among them. gp_std and spread at DEFAULT_N only.
     """
     words = data.key["hash"], n_vectors, inference_cycles.core_hash()
 
@@ -87,7 +87,7 @@ def fitted(folder, data, n_vectors):
             "seconds": seconds,
         }
 
-    key = inference_data.file_hash(sources_of("distil"), *words)
+    key = inference_data.file_hash([*sources_of("distil"), Path(__file__)], *words)
     return kept(Path(folder) / f"fit-{n_vectors}.pickle", key, make)
 
 
