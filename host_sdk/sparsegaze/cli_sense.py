@@ -7,6 +7,7 @@ from .cli_device import json_option, port_argument
 from .console import Console, pairs
 
 CHANNELS = 6
+NO_LIMIT_US = 65535 / 16  # FFFF on the wire takes a limit away
 
 
 class Rate(click.ParamType):
@@ -32,22 +33,35 @@ class Rate(click.ParamType):
 
 
 class Microseconds(click.ParamType):
-    """One number for all channels, or six with commas."""
+    """One number for all channels, or six with commas; with `none` also that word: NO_LIMIT_US."""
 
     name = "US[,US...]"
+
+    def __init__(self, none=False):
+        self.none = none
 
     def convert(self, value, param, ctx):
         if isinstance(value, tuple):
             return value
+        if self.none and value.strip().lower() == "none":
+            return (NO_LIMIT_US,) * CHANNELS
         try:
             numbers = tuple(float(part) for part in value.split(","))
         except ValueError:
             numbers = ()
         if len(numbers) not in (1, CHANNELS) or not all(0 < number < 4096 for number in numbers):
-            self.fail(
-                f"{value!r} is neither one number of microseconds nor {CHANNELS} with commas", param, ctx
-            )
+            words = f"{value!r} is neither one number of microseconds nor {CHANNELS} with commas"
+            self.fail(words + (", nor none" if self.none else ""), param, ctx)
         return numbers * (CHANNELS // len(numbers))
+
+
+def cycles_a_frame(now):
+    """Sensing cycles whose mean a frame is: in normal power those fill the frame's time, 16 at most."""
+    from .wire import REPEATS, lib
+
+    if now.power == lib.SG_POWER_LOW or not now.period_us:
+        return now.repeats
+    return min(max(now.repeats, now.frame_period_us // now.period_us), REPEATS[-1])
 
 
 def settings_report(now):
@@ -56,6 +70,7 @@ def settings_report(now):
         "rate_hz": now.frame_hz,
         "rate_limit_hz": now.rate_limit_hz,
         "repeats": now.repeats,
+        "cycles_a_frame": cycles_a_frame(now),
         "period_us": now.period_us,
         "frame_period_us": now.frame_period_us,
         "wiring": now.wiring_text,
@@ -68,7 +83,10 @@ def settings_report(now):
 def settings_lines(now, vectors, limits):
     """A wire.Settings in words; vectors of the model in use, 0: none; limits of rate_limits()."""
     with_model = f"the model of {vectors} vectors" if vectors else "no model"
-    cycles = "1 cycle" if now.repeats == 1 else f"the mean of {now.repeats} cycles"
+    count = cycles_a_frame(now)
+    cycles = "1 cycle" if count == 1 else f"the mean of {count} cycles"
+    dark = now.frame_period_us - count * now.period_us
+    pause = f", then {dark} us dark" if dark > count else ""
     return pairs(
         [
             ("rate", f"{now.frame_hz:.1f} Hz of the gaze"),
@@ -77,7 +95,7 @@ def settings_lines(now, vectors, limits):
                 f"{limits['gaze']} Hz with {with_model}; {limits['features']} Hz with the features too "
                 f"(stream --csv), {limits['counts']} Hz with --counts",
             ),
-            ("frame", f"{cycles} of {now.period_us} us, every {now.frame_period_us} us"),
+            ("frame", f"{cycles} of {now.period_us} us{pause}; a frame every {now.frame_period_us} us"),
             ("wiring", now.wiring_text),
             ("power", now.power_text),
             ("rolling", "a gaze after every pair of sensors" if now.rolling else "off: one gaze a frame"),
@@ -94,20 +112,25 @@ def settings_lines(now, vectors, limits):
     type=click.Choice(["1", "2", "4", "8", "16"]),
     help="Sensing cycles averaged into a frame: less noise, lower rate.",
 )
-@click.option("--power", type=click.Choice(["normal", "low"]), help="low: sleep more, light less.")
+@click.option(
+    "--power",
+    type=click.Choice(["normal", "low"]),
+    help="low: dark and asleep between frames. normal: that time goes into more cycles a frame, to average.",
+)
 @click.option(
     "--wiring",
     type=click.Choice(["leds", "photodiodes"]),
     help="What is on the pins: LEDs that sense and emit, or photodiodes and emitters of their own.",
 )
-@click.option("--rolling/--no-rolling", default=None, help="A gaze after every two sensors, three a cycle.")
+@click.option("--rolling/--no-rolling", default=None, help="A gaze after every two sensors, three a cycle; firmware "
+              "without the time for that, the Nano's, refuses it.")
 @click.option("--lights", type=click.Choice(["on", "off"]), help="off: no LED is lit until switched on.")
 @json_option
 def settings(port, rate, repeats, power, wiring, rolling, lights, as_json):
     """How the device at PORT senses: frame rate, averaging, power, wiring, lights. Without options: shows it.
 
     What can be reached depends on the model and on what is streamed: the device computes its own limit, and
-    never runs faster. Settings survive a restart.
+    never runs faster. Settings survive a restart. What they draw: `sparsegaze doctor HEADSET.toml`.
 
     \b
     Example:
@@ -161,16 +184,16 @@ def change(device, port, wanted):
     before, written = device.settings(), device.status().eeprom_writes
     if not wanted:
         return before, vectors
-    if wanted.get("rolling") and wanted.get("repeats", before.repeats) != 1:
-        raise SparsegazeError(
-            f"a frame is the mean of {before.repeats} cycles, and rolling output shows single ones",
-            f"sparsegaze settings {port} --rolling --repeats 1",
-        )
     try:
         now = device.settings(**wanted)
     except DeviceError as error:
         if error.code not in (lib.SG_E_ARG, lib.SG_E_RANGE, lib.SG_E_STATE):
             raise
+        if wanted.get("rolling"):
+            raise SparsegazeError(
+                "this firmware gives one gaze a frame: a cycle has no time for three inferences",
+                f"leave --rolling out, nothing was changed; sparsegaze settings {port} --rate max gives the most gazes",
+            ) from None
         asked = ", ".join(f"{name.replace('_hz', '')} {value}" for name, value in wanted.items())
         raise SparsegazeError(
             f"the device refuses {asked}; it can do at most {before.rate_limit_hz} Hz now",
@@ -209,7 +232,9 @@ def change(device, port, wanted):
 @click.option("--auto", "mode", flag_value="auto", help="Adapt them to the light: a new board's way.")
 @click.option("--hold", "mode", flag_value="hold", help="Stay at those in force.")
 @click.option("--set", "fixed", type=Microseconds(), help="Hold these: one number for all, or six.")
-@click.option("--limit", type=Microseconds(), help="Automatic exposure stays at or below these.")
+@click.option(
+    "--limit", type=Microseconds(none=True), help="Automatic exposure stays at or below these; none: no limit."
+)
 @json_option
 def exposure(port, mode, fixed, limit, as_json):
     """The six exposure times of the device at PORT, in microseconds. Without options: shows them.

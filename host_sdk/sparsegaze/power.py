@@ -13,7 +13,7 @@ emitters and analog front end alone, for its photodiode headset.
 from dataclasses import asdict, dataclass
 
 from .eyesafety import SUPPLY_V, currents_ma
-from .timing import CPU_HZ, SLOT_CYCLES_MAX, Timing
+from .timing import CPU_HZ, Timing
 
 # ATmega328P at 16 MHz and 5 V, typical supply current: data sheet DS40002061, figures "Active Supply
 # Current vs. Frequency (1-20 MHz)" and "Idle Supply Current vs. Frequency (1-20 MHz)".
@@ -63,11 +63,13 @@ class Budget:
 
 
 def settings():
-    """(name, Timing, whether it sleeps) of the settings that a budget is given for."""
-    quarter = CPU_HZ // 250
+    """(name, Timing, whether it sleeps) of the settings that a budget is given for.
+
+    In normal power a slower frame is the mean of more cycles, without a pause: it draws what the fastest does.
+    """
     yield "default", Timing(), False
-    yield "250 Hz", Timing(SLOT_CYCLES_MAX, frame_cycles=quarter), False
-    yield "250 Hz, low power", Timing(frame_cycles=quarter), True
+    yield "250 Hz, 4 cycles", Timing(repeats=4), False
+    yield "250 Hz, low power", Timing(frame_cycles=CPU_HZ // 250), True
     yield "60 Hz, low power", Timing(frame_cycles=CPU_HZ // 60), True
 
 

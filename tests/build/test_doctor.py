@@ -108,7 +108,7 @@ def test_the_doctors_figures_as_one_object(repo_root):
         assert least < data["eye_safety"]["irradiance_w_m2"][case] < most
     rows = data["eye_safety"]["rows"]
     assert all(row["value"] * row["margin"] == pytest.approx(row["limit"]) for row in rows)
-    assert [one["setting"] for one in data["power"]][:2] == ["default", "250 Hz"]
+    assert [one["setting"] for one in data["power"]][:2] == ["default", "250 Hz, 4 cycles"]
     assert data["paper_mw"] == {"leds": 800, "photodiodes": 16}
 
 

@@ -69,10 +69,22 @@ def test_nonsense_is_refused_before_the_port_is_opened(command, monkeypatch, arg
     assert code == 2 and word in err
 
 
-def test_rolling_while_frames_are_means_names_the_way_out(command, fake):
-    fake().settings(repeats=4)
-    code, _, err = command("settings", "PORT", "--rolling")
-    assert code == 1 and "mean of 4 cycles" in err and "--rolling --repeats 1" in err
+def test_rolling_that_the_firmware_refuses_is_said_with_the_reason(command, fake):
+    device = fake(refuse=("rolling",))
+    code, out, err = command("settings", "PORT", "--rolling")
+    assert code == 1 and out == "" and "no time for three inferences" in err and "leave --rolling out" in err
+    assert device.sensing["rolling"] == 0
+
+
+def test_a_slow_frame_is_said_to_be_the_mean_of_all_its_cycles(command, command_json, fake):
+    device = fake()
+    assert command_json("settings", "PORT", "--rate", "250")[1]["cycles_a_frame"] == 4
+    assert "the mean of 4 cycles of 999 us" in command("settings", "PORT")[1]
+    assert command_json("settings", "PORT", "--rate", "20")[1]["cycles_a_frame"] == 16
+    assert command_json("settings", "PORT", "--power", "low")[1]["cycles_a_frame"] == 1
+    out = command("settings", "PORT")[1]
+    assert "1 cycle of 999 us, then 49001 us dark; a frame every 50000 us" in out
+    assert device.sensing["repeats"] == 1
 
 
 def test_what_the_firmware_refuses_is_said_with_what_it_can(command, fake):
@@ -102,6 +114,8 @@ def test_exposure_shows_sets_holds_limits_and_goes_back_to_automatic(command, co
     assert not data["clipped"]
     assert command_json("exposure", "PORT", "--auto", "--limit", "90")[1]["automatic"] is True
     assert device.limits == (90.0,) * 6
+    assert command_json("exposure", "PORT", "--limit", "none")[0] == 0
+    assert [round(16 * limit) for limit in device.limits] == [0xFFFF] * 6
     code, out, _ = command("exposure", "PORT", "--hold")
     assert code == 0 and "held" in out and not device.automatic
 
@@ -114,7 +128,7 @@ def test_an_exposure_that_had_to_be_moved_is_said(command, fake):
 
 @pytest.mark.parametrize(
     "args", [["--set", "10,20"], ["--set", "-5"], ["--set", "long"], ["--limit", "0"], ["--set", "nan"],
-             ["--hold", "--limit", "50"], ["--auto", "--set", "50"]]
+             ["--hold", "--limit", "50"], ["--auto", "--set", "50"], ["--set", "none"], ["--limit", "inf"]]
 )
 def test_exposures_that_make_no_sense(command, monkeypatch, args):
     monkeypatch.setattr("sparsegaze.device.Device", lambda *_: pytest.fail("the port was opened"))

@@ -40,8 +40,15 @@ def test_a_pause_between_frames_saves_light_and_sleep_saves_the_rest(drawn):
     default, low = drawn["default"], drawn["250 Hz, low power"]
     assert low.emitter_mw == pytest.approx(default.emitter_mw * low.rate_hz / default.rate_hz)
     assert low.mcu_mw < 0.7 * default.mcu_mw
-    assert low.total_mw < drawn["250 Hz"].total_mw < default.total_mw
+    assert low.total_mw < 0.5 * default.total_mw
     assert drawn["60 Hz, low power"].total_mw < low.total_mw
+
+
+def test_a_slower_rate_alone_saves_nothing(drawn):
+    # Without low power the time is filled with cycles: 4 of 15,984 cycles make a frame of 250 Hz.
+    default, slow = drawn["default"], drawn["250 Hz, 4 cycles"]
+    assert slow.rate_hz == pytest.approx(16e6 / (4 * 15984)) and slow.lit == pytest.approx(default.lit)
+    assert slow.total_mw == pytest.approx(default.total_mw)
 
 
 def test_asleep_all_the_time_it_draws_what_the_data_sheet_calls_idle(led2gaze):
