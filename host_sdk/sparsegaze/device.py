@@ -155,9 +155,10 @@ class Device(Sensing):
         bits = (lib.SG_STREAM_RAW * bool(raw) | lib.SG_STREAM_GAZE * bool(gaze)
                 | lib.SG_STREAM_COUNTS * bool(counts))
         was, self._stream_bits = self._stream_bits, bits
+        if not was:
+            self._exchange.forget_stream(until=lib.SG_MSG_MODE | lib.SG_REPLY)
         self._exchange.request(lib.SG_MSG_MODE, wire.body("struct sg_mode", mode=bits), Mode)
         if not was:
-            self._exchange.forget_stream()
             self._assembler.clear()
         self._assembler.expect(bits)
 

@@ -28,6 +28,7 @@ class Exchange:
         self.decoder = wire.Decoder()
         self._seq = 0
         self._stream = deque()
+        self._stale_until = None
 
     def restart(self):
         """Forget all that was received: the device was reset."""
@@ -58,6 +59,8 @@ class Exchange:
                     self.dropped += 1
                 self._stream.append((packet, now))
             else:
+                if packet.type == self._stale_until:
+                    self.forget_stream()
                 answers.append(packet)
         return answers
 
@@ -66,8 +69,11 @@ class Exchange:
         while self._stream:
             yield self._stream.popleft()
 
-    def forget_stream(self):
+    def forget_stream(self, until=None):
+        """Forget the stream packets received so far, and those that come before the next answer of type
+        `until`; what follows it belongs to another stream, even if both arrive at once."""
         self._stream.clear()
+        self._stale_until = until
 
     def request(self, kind, body=b"", answer=None, sent=None):
         """Send one request and return its answer, parsed as the record type `answer` (None: the body's

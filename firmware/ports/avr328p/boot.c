@@ -21,6 +21,8 @@ static struct {                         // registers as they were found; a reset
 static uint8_t cause;
 
 extern uint8_t __heap_start;    // first byte after all static data
+static const uint8_t *looked_at = &__heap_start;
+static uint16_t stack_free;             // by the latest look that came to its end
 
 // Before anything else uses registers or stack. A watchdog reset leaves the watchdog running at 16 ms: off at
 // once.
@@ -93,16 +95,25 @@ uint8_t boot_reset_cause(void)
     return cause;
 }
 
-uint16_t boot_stack_free(void)
+// In strides, because a frame waits meanwhile: what is deepest on a stack is addresses and registers in a
+// row.
+uint8_t boot_look_at_stack(void)
 {
-    // In strides, because a frame waits meanwhile: what is deepest on a stack is addresses and registers in a
-    // row.
-    const uint8_t *p = &__heap_start;
-    while (p[STRIDE - 1] == PAINT)
-        p += STRIDE;
+    const uint8_t *p = looked_at;
+    if (p[STRIDE - 1] == PAINT) {
+        looked_at = p + STRIDE;
+        return 0;
+    }
     while (*p == PAINT)
         p++;
-    return (uint16_t)(p - &__heap_start);
+    stack_free = (uint16_t)(p - &__heap_start);
+    looked_at = &__heap_start;
+    return 1;
+}
+
+uint16_t boot_stack_free(void)
+{
+    return stack_free;
 }
 
 void boot_watchdog_on(void)

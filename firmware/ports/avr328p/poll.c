@@ -33,6 +33,8 @@ void hal_start(struct hal_timing *timing, uint16_t exposure_cycles[HAL_CHANNELS]
     serial_start();
     sense_start(timing, exposure_cycles);
     boot_watchdog_on();
+    while (!boot_look_at_stack()) {
+    }
     sei();
 }
 
@@ -63,6 +65,7 @@ int hal_poll(void)
     sense_poll();
     serial_poll();
     store_poll();
+    boot_look_at_stack();
     sleep_if_idle();
     return 1;
 }

@@ -38,7 +38,8 @@ enum port_limits {
 
 // boot.c
 uint8_t boot_reset_cause(void);         // bits of enum sg_reset
-uint16_t boot_stack_free(void);         // bytes between the static data and the deepest stack since boot
+uint8_t boot_look_at_stack(void);       // goes on looking for its deepest byte; 1 when that is found
+uint16_t boot_stack_free(void);         // bytes between the static data and the deepest found last
 void boot_watchdog_on(void);            // 120 ms
 _Noreturn void boot_restart(void);      // through the watchdog, lights out first
 

@@ -9,7 +9,7 @@
 
 enum {
     RX_RING = 128,                              // power of two
-    TX_RING = 192,                              // a frame of all three streams (116) and an answer (72)
+    TX_RING = 252,                              // frames of all three streams (108), and two answers (72)
 };
 
 extern uint8_t rx_ring[RX_RING];

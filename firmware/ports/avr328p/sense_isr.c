@@ -101,7 +101,8 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "add r24, r26" "\n\t"
         "adc r25, r27" "\n\t"
         "sts %[match]+1, r25" "\n\t"
-        "sts %[match], r24" "\n\t"
+        "sts %[match], r24" "\n"
+        "sense_when:" "\t"
         "lds r26, %[now]" "\n\t"
         "lds r27, %[now]+1" "\n\t"
         "sub r24, r26" "\n\t"
@@ -110,7 +111,10 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "brne 3f" "\n\t"
         "cpi r24, %[soon]" "\n\t"
         "brlo sense_soon" "\n\t"
-        "rjmp sense_leave" "\n"                // the line can wait
+        "lds r24, %[state]" "\n\t"            // sending can wait, receiving cannot
+        "sbrc r24, %[came]" "\n\t"
+        "rjmp sense_receive_then" "\n\t"
+        "rjmp sense_leave" "\n"
         "3:" "\t"
         "cpi r25, %[cycles] + 1" "\n\t"
         "brsh sense_due" "\n"
@@ -239,11 +243,17 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "mov r24, r27" "\n\t"
         "andi r24, %[alone]" "\n\t"
         "cpi r24, %[alone]" "\n\t"
-        "breq 5f" "\n\t"
+        "breq 5f" "\n"
+        "4:" "\t"
+        "lds r24, %[state]" "\n\t"
+        "sbrc r24, %[came]" "\n\t"
+        "rjmp 6f" "\n\t"
         "in r30, %[list_low]" "\n\t"
         "in r31, %[list_high]" "\n\t"
         "rjmp sense_service" "\n"
         "5:" "\t" "rjmp sense_then" "\n"
+        "6:" "\t" "rcall sense_byte" "\n\t"
+        "rjmp 4b" "\n"
         // Too late to wait: at once, and by how much goes into the reading.
         "sense_near:" "\t" "subi r25, %[fixed]" "\n\t"
         "nop" "\n"
@@ -473,13 +483,19 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
                      "pop r31" "\n\t"
                      "pop r30" "\n\t"
                      "rjmp sense_wait_lit" "\n"
+                     "sense_receive_then:" "\t"
+                     "rcall sense_byte" "\n\t"
+                     "lds r24, %[match]" "\n\t"
+                     "lds r25, %[match]+1" "\n\t"
+                     "rjmp sense_when" "\n"
                      "sense_receive_next:" "\t"
                      "rcall sense_byte" "\n\t"
                      "rjmp sense_next" "\n"
                      "sense_receive:" "\t"
                      "rcall sense_byte" "\n\t"
                      "rjmp sense_exit" "\n"
-                     "sense_byte:" "\t");
+                     "sense_byte:" "\t"
+                     : : [match] "i"(_SFR_MEM_ADDR(OCR1AL)));
     serial_receive();
     __asm__ volatile("ret" "\n\t");
 }

@@ -2,15 +2,19 @@
 // UART0 with a ring each way. At 1 Mbaud a byte takes 160 cycles. The receiver bridges two, so it has its
 // interrupt. A gaze frame is sent without one: by the main loop while it has nothing else to do, and by the
 // sensing interrupt before it returns, up to two bytes each of the 18 times a cycle. That saves some 40
-// cycles a byte, and no release waits. Only when more waits than they can carry do its first bytes go by
-// their own interrupt.
+// cycles a byte, and no release waits: one that is late costs its reading a correction of 700 cycles. Only
+// when more waits than they can carry do its first bytes go by their own interrupt.
 #include "port.h"
 #include "port_serial.h"
 
 enum {
     AROUND_BODY = SG_WIRE_FRAME_MAX - SG_WIRE_BODY_MAX,
     POLLED = (1 << RXCIE0) | (1 << RXEN0) | (1 << TXEN0),       // UCSR0B
-    POLLED_BYTES = 24,                  // as many as wait are left to the polling
+    // As many as wait are left to the polling: an answer and a gaze; after a long frame of a stream fewer, the
+    // next gaze would be late.
+    POLLED_BYTES = 96,
+    POLLED_LONG = 24,
+    LONG_BODY = 16,
     SENT_MEANWHILE = 8,                 // by the sensing interrupt
     BYTES_PER_POLL = 32,                // so that a flood of bytes cannot keep a frame waiting
     DRAIN_CYCLES = 4 * 10 * 2 * 16,     // the last two bytes leave the shift register, at the lower speed
@@ -121,11 +125,17 @@ uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_
     const uint8_t end = (uint8_t)sg_wire_encode_ring(head, body, n, tx_ring, TX_RING, tx_head);
     __asm__ volatile("" : : : "memory");      // the bytes are there before they are sent
     tx_head = end;
+    const uint8_t polled = keep_free && n > LONG_BODY ? POLLED_LONG : POLLED_BYTES;
     const uint8_t waiting = TX_RING - 1 - serial_room();
-    if (waiting > POLLED_BYTES + SENT_MEANWHILE) {
+    if (waiting > polled + SENT_MEANWHILE) {
+        // No more by the interrupt than this packet has: an answer is worked off by the polling, bit by bit.
+        uint8_t sent = waiting - polled;
+        if (sent > n + AROUND_BODY)
+            sent = n + AROUND_BODY;
         ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+            const uint8_t tail = tx_tail;
             UCSR0B = POLLED | (1 << UDRIE0);
-            tx_until = end >= POLLED_BYTES ? end - POLLED_BYTES : end + TX_RING - POLLED_BYTES;
+            tx_until = tail >= TX_RING - sent ? tail - (TX_RING - sent) : tail + sent;
         }
     }
     return 1;
@@ -190,20 +200,22 @@ uint8_t serial_poll(void)
         carry_out();
     if (rx_tail == rx_head)
         return 0;
-    while (left-- && rx_tail != rx_head && app_listens() && serial_room() >= SG_WIRE_FRAME_MAX
-           && !after_pending) {
-        uint16_t zero;
-        ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
-            zero = zero_ticks;
-        }
+    while (left-- && rx_tail != rx_head && !after_pending) {
         const uint8_t byte = rx_ring[rx_tail];
-        rx_tail = (rx_tail + 1) & (RX_RING - 1);
-        // Only a frame's end asks for the time; it is less than one turn of the timer ago.
         uint32_t zero_us = 0;
+        // Only a frame's end makes work, and asks for the time; it is less than one turn of the timer ago. With
+        // room for an answer and for as much of the streams, so that none of them is left out for it.
         if (byte == 0) {
+            if (!app_listens() || serial_room() < 2 * SG_WIRE_FRAME_MAX)
+                break;
+            uint16_t zero;
+            ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+                zero = zero_ticks;
+            }
             const uint32_t now_us = hal_now_us();
             zero_us = now_us - ((uint16_t)((uint16_t)(now_us << 4) - zero) >> 4);
         }
+        rx_tail = (rx_tail + 1) & (RX_RING - 1);
         app_on_byte(byte, zero_us);
     }
     return 1;
