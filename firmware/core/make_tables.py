@@ -35,6 +35,8 @@ PERIOD_FROM, PERIOD_STEP, PERIOD_NODES = 15984, 2048, 9
 NOISE_LSB = 0.755
 CLIPPED_NODES, CLIPPED_OFFSET = 40, 128
 
+EXP_WORDS = 384           # of the kernel's table: from here on a byte holds the level
+
 LICENSE = "// SPDX-License-Identifier: Apache-2.0\n"
 MADE_BY = "// Made by make_tables.py; edit that.\n"
 
@@ -45,10 +47,10 @@ def rounded(x):
 
 
 def exp_table():
-    """2^16 exp(-i / 64), i = 0..768, Q0.16; the last is 0.
+    """2^16 exp(-i / 64), i = 0..710, Q0.16; the last is 0.
 
     The device goes on from a node along its tangent, with the upper byte of the level only."""
-    level = [math.floor(65536 * math.exp(-i / 64)) for i in range(769)]
+    level = [math.floor(65536 * math.exp(-i / 64)) for i in range(711)]
     level[0] = 65535
     return level
 
@@ -63,8 +65,10 @@ def rows(values, per_row=12):
 
 def gp_table():
     """Text of sg_gp_table.c."""
+    words, tail = exp_table()[:EXP_WORDS], exp_table()[EXP_WORDS:]
     return (LICENSE + MADE_BY + '#include "sg_gp_loop.h"\n#include "sg_rom.h"\n\n'
-            "const uint16_t sg_gp_exp_table[SG_GP_EXP_ENTRIES] SG_ROM = {\n" + rows(exp_table()) + "};\n")
+            "const uint16_t sg_gp_exp_table[SG_GP_EXP_WORDS] SG_ROM = {\n" + rows(words) + "};\n\n"
+            "const uint8_t sg_gp_exp_tail[SG_GP_EXP_BYTES] SG_ROM = {\n" + rows(tail, 18) + "};\n")
 
 
 def tanh_table():

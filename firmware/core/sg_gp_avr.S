@@ -9,6 +9,8 @@
 #define SUM_S2 8
 #define SUM_S 12
 #define SUM_S8 24
+#define EXP_WORDS 384
+#define EXP_LAST 710
 
 ; body, for the memory that bit 0 of a register says (SG_ROM_FLASH)
 .macro by_space space, body
@@ -100,12 +102,8 @@
     channel \load, s4l, s4h
     channel \load, s5l, s5h
 
-    cpi t2, 0x0C                ; T >= 12 * 2^16: k = 0, which the table says there
-    sbc r0, r0                  ; all ones below; the carry stays
-    and t1, r0
-    brlo 2f                     ; as long as the instruction it jumps over
-    ldi t2, 0x0C
-2:
+    cpi t2, EXP_WORDS >> 6
+    brsh 5f
     movw r26, r30
     movw r30, t1
     lsr r31
@@ -128,12 +126,33 @@
     sbc t2, zero
     sub t1, r1
     sbc t2, zero
+2:
     movw r30, r26
     weigh \load, az0, az1, az2
     weigh \load, el0, el1, el2
     dec left
     breq 3f
     rjmp 1b
+5:                              ; a level of one byte, which does not fall: as long as above
+    movw r26, r30
+    ldi r30, lo8(EXP_LAST << 2)
+    ldi r31, hi8(EXP_LAST << 2)
+    cp t1, r30
+    cpc t2, r31
+    brsh 6f                     ; as long as the instruction it jumps over
+    movw r30, t1
+6:
+    lsr r31
+    ror r30
+    lsr r31
+    ror r30                     ; T >> 10
+    subi r30, lo8(-(sg_gp_exp_tail - EXP_WORDS))
+    sbci r31, hi8(-(sg_gp_exp_tail - EXP_WORDS))
+    lpm t1, Z
+    ldi t2, 0
+    lpm r0, Z                   ; time
+    lpm r0, Z
+    rjmp 2b
 3:
 .endm
 

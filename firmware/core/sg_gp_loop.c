@@ -13,8 +13,13 @@
 static inline uint16_t kernel_q16(uint32_t t)
 {
     uint16_t index = (uint16_t)(t >> 8) >> 2;  // 23 bits: whole bytes first, they cost nothing
-    if (index >= 768U)
-        index = 768U;   // where the table holds a zero
+    if (index >= SG_GP_EXP_WORDS) {
+        // A level below 256 has no upper byte to fall by; the last is 0, and so is what follows.
+        index = (uint16_t)(index - SG_GP_EXP_WORDS);
+        if (index >= SG_GP_EXP_BYTES)
+            index = SG_GP_EXP_BYTES - 1U;
+        return sg_rom_byte(&sg_gp_exp_tail[index], SG_ROM_FLASH);
+    }
     const uint16_t level_q16 = sg_rom_word(&sg_gp_exp_table[index]);
     const uint8_t fraction_q8 = (uint8_t)((uint16_t)t >> 2);
     return (uint16_t)(level_q16 - ((uint16_t)((uint16_t)(level_q16 >> 8) * fraction_q8) >> 6));

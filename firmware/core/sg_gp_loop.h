@@ -7,9 +7,11 @@
 #include <stddef.h>
 #include <stdint.h>
 
-// 2^16 exp(-(i / 64)) for i = T >> 10, Q0.16; zeros from 710 on. See make_tables.py.
-enum { SG_GP_EXP_ENTRIES = 769 };
-extern const uint16_t sg_gp_exp_table[SG_GP_EXP_ENTRIES];
+// 2^16 exp(-(i / 64)) for i = T >> 10, Q0.16: in words while it needs them, then in bytes, to the first that is 0.
+// See make_tables.py.
+enum { SG_GP_EXP_WORDS = 384, SG_GP_EXP_BYTES = 711 - SG_GP_EXP_WORDS };
+extern const uint16_t sg_gp_exp_table[SG_GP_EXP_WORDS];
+extern const uint8_t sg_gp_exp_tail[SG_GP_EXP_BYTES];
 
 struct sg_gp_sum {
     uint32_t acc[2];    // azimuth and elevation, Q.(weight_frac_bits + 8), 24 bits

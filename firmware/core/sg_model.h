@@ -10,9 +10,9 @@
 //   s_j  = clamp(((x_j - offset_j) * gain_q12_j) >> 12, 0, 4095)       u8.4, u = 64 whole steps a length scale
 //   S2   = (sum_j s_j^2 + 31) >> 5
 //   T_i  = S2 + 256 * half_c2_i - sum_j c_ij * s_j                     half squared distance, 20.4, at least 0
-//   k_i  = exp(-T_i / 2^16)                                            Q0.16, 0 from T_i >= 12 * 2^16
+//   k_i  = exp(-T_i / 2^16)                                            Q0.16, 0 from T_i >= 710 * 2^10
 //   gaze = ((bias + sum_j trend_j * s_j) >> 4) + sum_i weight_i * k_i  24-bit, 2^-(weight_frac_bits + 8) deg
-// with, L being a table of 769 entries (make_tables.py), k = 0 from its last on and >> floors,
+// with, L being a table of 711 entries (make_tables.py), k = 0 from its last on and >> floors,
 //   i = T >> 10,  f = (T >> 2) & 255,  k = L[i] - (((L[i] >> 8) * f) >> 6)
 //   weight * k = (weight * k - (weight & 255) * (k & 255)) / 256       a multiple of 256 before the division
 // half_c2_i is 8 * sum_j c_ij^2 in units of 256, rounded up; the weight takes the difference.

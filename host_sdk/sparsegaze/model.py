@@ -32,7 +32,7 @@ KERNEL_RBF = 0
 S_MAX = 4095  # largest input, u8.4
 S_FRAC = 16  # input steps per centre step
 U_STEPS = 64.0  # centre steps per length scale: T >> 16 then counts e-folds
-TABLE_END = 768  # of T >> 10: the kernel is 0 from here on
+TABLE_END = 710  # of T >> 10: the kernel is 0 from here on
 
 FLAG_VALID, FLAG_NO_MODEL, FLAG_OUT_OF_RANGE = 1, 2, 4
 FLAG_SATURATED, FLAG_STARVED = 8, 16
