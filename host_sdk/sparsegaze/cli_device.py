@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands about boards: doctor, list, virtual, flash, info, upload."""
 
+import math
 import time
 
 import click
@@ -14,6 +15,16 @@ json_option = click.option(
     help="Print exactly one JSON object on stdout; progress goes to stderr.",
 )
 port_argument = click.argument("port")
+
+
+class Number(click.FloatRange):
+    """A finite number in a range: click's own takes nan for one."""
+
+    def convert(self, value, param, ctx):
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is no finite number.", param, ctx)
+        return number
 
 
 @click.command()
@@ -299,7 +310,7 @@ def info(port, as_json):
             ),
             (
                 "frames",
-                f"{settings.frame_hz:.1f} Hz (at most {settings.rate_limit_hz}), {hello.channels} channels, "
+                f"{settings.frame_hz:.1f} Hz (at most {settings.most_hz}), {hello.channels} channels, "
                 f"wired as {settings.wiring_text}",
             ),
             ("faults", "; ".join(fault.text for fault in found) or "none"),

@@ -8,7 +8,7 @@ import warnings
 
 import click
 
-from .cli_device import json_option, port_argument
+from .cli_device import Number, json_option, port_argument
 from .console import Console, pairs, table
 
 VECTORS = click.IntRange(1, 91)  # choose.ROOM
@@ -22,14 +22,14 @@ def screen_options(command):
         click.option("--windowed", is_flag=True, help="Show targets in a window instead of full screen."),
         click.option(
             "--width-mm",
-            type=click.FloatRange(1.0, 10000.0),
+            type=Number(1.0, 10000.0),
             default=530.0,
             show_default=True,
             help="Width of the screen's picture, mm. Real device only.",
         ),
         click.option(
             "--distance-mm",
-            type=click.FloatRange(1.0, 100000.0),
+            type=Number(1.0, 100000.0),
             default=600.0,
             show_default=True,
             help="Distance from the eye to the screen, mm. Real device only.",
@@ -239,7 +239,7 @@ def record(port, output, n_targets, seed, distance_mm, width_mm, windowed, as_js
     show_default=True,
     help="Distance measure of the full process. The device's own kernel is always the rbf.",
 )
-@click.option("--p", type=click.FloatRange(0.0, min_open=True), help="Order of the Minkowski distance.")
+@click.option("--p", type=Number(0.0, min_open=True), help="Order of the Minkowski distance.")
 @click.option(
     "--budget-cycles",
     type=click.IntRange(min=1),

@@ -52,7 +52,12 @@ def _safety_lines(headset, report):
         )
     else:
         most = 0.99 * max(p.intensity_mw_sr for p in headset.emitters) * report.margin
-        yield "NOT SAFE -> emitters of at most %.3g mW/sr at that current: less current, or others" % most
+        yield "NOT SAFE: %s x the limit (%s, %s) -> emitters of at most %.3g mW/sr: less current, or others" % (
+            _figure(1 / report.margin),
+            report.worst.case,
+            report.worst.quantity,
+            most,
+        )
     for sentence in report.assumed:
         yield "  - " + sentence
     yield "  - nearest emitter to the cornea: %.1f mm, %.1f at worst" % report.nearest_mm

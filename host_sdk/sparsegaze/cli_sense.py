@@ -92,7 +92,7 @@ def settings_lines(now, vectors, limits):
             ("rate", f"{now.frame_hz:.1f} Hz of the gaze"),
             (
                 "at most",
-                f"{limits['gaze']} Hz with {with_model}; {limits['features']} Hz with the features too "
+                f"{max(limits['gaze'], int(now.frame_hz))} Hz with {with_model}; {limits['features']} Hz with the features too "
                 f"(stream --csv), {limits['counts']} Hz with --counts",
             ),
             ("frame", f"{cycles} of {now.period_us} us{pause}; a frame every {now.frame_period_us} us"),

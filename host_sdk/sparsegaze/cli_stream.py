@@ -5,7 +5,7 @@ import sys
 
 import click
 
-from .cli_device import json_option, port_argument
+from .cli_device import Number, json_option, port_argument
 from .console import Console
 
 
@@ -13,8 +13,8 @@ from .console import Console
 @port_argument
 @click.option(
     "--seconds",
-    type=click.FloatRange(min=0.0, min_open=True),
-    help="Stop after this long, device time.  " "[default: until Ctrl-C]",
+    type=Number(min=0.0, min_open=True),
+    help="Stop after this long, device time.  [default: until Ctrl-C]",
 )
 @click.option(
     "--csv",

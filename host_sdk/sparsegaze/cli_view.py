@@ -5,7 +5,7 @@ import os
 
 import click
 
-from .cli_device import json_option
+from .cli_device import Number, json_option
 from .cli_map import person_of
 from .console import Console, pairs
 
@@ -56,7 +56,7 @@ class Gaze(click.ParamType):
 )
 @click.option(
     "--reach",
-    type=click.FloatRange(0.1, 20.0),
+    type=Number(0.1, 20.0),
     default=3.0,
     show_default=True,
     help="The image covers +- so many sigma of the sensor's window.",

@@ -66,7 +66,7 @@ def _supply(status):
     volts = status.supply_volts
     measured = "the supply voltage" if volts is None else f"the supply voltage, {volts:.2f} V,"
     return (
-        f"{measured} moved by more than 4 % since the start, or is not within 4.5 to 5.5 V",
+        f"{measured} moved by more than 4 % since the board started",
         "use another USB port or a shorter cable, without a hub",
     )
 

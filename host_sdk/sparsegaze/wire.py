@@ -150,6 +150,11 @@ class Settings(record("struct sg_settings", "Settings")):
         return 1e6 / self.frame_period_us if self.frame_period_us else 0.0
 
     @property
+    def most_hz(self):
+        """rate_limit_hz, but not below the rate in force: the device rounds the one down, the other up."""
+        return max(self.rate_limit_hz, int(self.frame_hz))
+
+    @property
     def wiring_text(self):
         return _name_of(WIRINGS, self.wiring)
 

@@ -117,7 +117,8 @@ def test_the_doctor_fails_over_the_limit_and_says_what_would_do(repo_root, tmp_p
     text = (repo_root / "headsets" / "led2gaze.toml").read_text()
     path.write_text(text.replace("intensity_mw_sr = 15.0", "intensity_mw_sr = 60.0"))
     code, out, _ = run("doctor", path)
-    assert code == 1 and "NOT SAFE" in out and "OVER  any fault" in out
+    assert code == 1 and "OVER  any fault" in out
+    assert "NOT SAFE: 3.78 x the limit (any fault, cornea, average, supply) -> emitters of at most" in out
     remedy = re.search(r"emitters of at most ([0-9.]+) mW/sr", out)
     path.write_text(text.replace("intensity_mw_sr = 15.0", "intensity_mw_sr = %s" % remedy.group(1)))
     assert run("doctor", path)[0] == 0, "the remedy is one"

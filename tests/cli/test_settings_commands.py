@@ -174,6 +174,28 @@ def test_a_board_that_is_well(command, command_json, fake):
     assert "no fault" in command("status", "PORT")[1]
 
 
+@pytest.mark.parametrize("late, name", [(3, "ok "), (90, "note")])
+def test_a_few_late_frames_are_ordinary_and_many_are_worth_a_slower_rate(
+    command, fake, monkeypatch, late, name
+):
+    device = fake(linear_model(), limit_hz=800)
+    told = device.status()._replace(frames=2000, late_frames=late)
+    monkeypatch.setattr(device, "status", lambda: told)
+    code, out, _ = command("doctor", "PORT")
+    line, after = (out[out.index("rate:") - 10 :] + "\n").split("\n", 1)
+    assert code == 0 and line.startswith(name) and f"frames: {late} late" in line
+    assert ("sparsegaze settings PORT --rate 720" in after) == (name == "note")
+
+
+def test_the_rate_in_force_is_never_said_to_be_above_the_limit(command, fake, monkeypatch):
+    device = fake()
+    rounded = device.settings()._replace(rate_limit_hz=929, frame_period_us=1075)    # 1075.5
+    monkeypatch.setattr(device, "settings", lambda **_: rounded)
+    for name in ("settings", "doctor", "info"):
+        out = command(name, "PORT")[1]
+        assert "930.2 Hz" in out and "at most 930" in out.replace("at most  930", "at most 930"), name
+
+
 def test_doctor_of_a_port_with_nothing_behind_it_is_a_finding_not_a_crash(command):
     code, out, err = command("doctor", "/dev/no-such-port")
     assert code == 1 and "FAULT" in out and "no such port" in out and err == ""
@@ -205,3 +227,10 @@ def test_counts_of_a_stream_are_kept_and_replay_does_not_mind(command, command_j
     assert 400 < int(row["lit3"]) < 900 and int(row["unlit3"]) < 10 and float(row["exposure3_us"]) == 50
     assert command_json("replay", path, "--model", model)[1]["identical"] is True
     assert command("stream", "PORT", "--counts")[0] == 2
+
+
+@pytest.mark.parametrize("seconds", ["nan", "inf", "-1", "0"])
+def test_a_stream_of_no_finite_length_is_refused_before_the_port_is_opened(command, monkeypatch, seconds):
+    monkeypatch.setattr("sparsegaze.device.Device", lambda *_: pytest.fail("the port was opened"))
+    code, _, err = command("stream", "PORT", "--seconds", seconds)
+    assert code == 2 and "--seconds" in err and len(err.splitlines()) == 1
