@@ -12,6 +12,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sparsegaze import choose
+from sparsegaze.errors import ModelError
+from sparsegaze.model import HEAD_BYTES, RECORD_BYTES
+from sparsegaze.trust import NODE_BYTES
+
 BENCH = Path(__file__).resolve().parents[2] / "tools" / "bench"
 FRONTIER = {
     "dataset",
@@ -48,6 +53,26 @@ def bench():
         picture=inference_picture,
         pieces=inference_pieces,
     )
+
+
+# -- sizes ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ladder", ["LADDER", "QUICK_LADDER"])
+def test_every_size_fits_a_slot_of_the_nano(bench, ladder):
+    sizes = getattr(bench.run, ladder)
+    assert sorted(set(sizes)) == list(sizes) and bench.pieces.DEFAULT_N in sizes
+    for n in sizes:
+        assert choose.most_vectors(None, n) == n
+        assert HEAD_BYTES + NODE_BYTES * (choose.cells(n) + 1) ** 2 + RECORD_BYTES * n <= choose.NANO_SLOT_BYTES
+    with pytest.raises(ModelError):
+        choose.most_vectors(None, bench.run.LADDER[-1] + 1)
+
+
+def test_the_sizes_that_bars_are_judged_at_are_the_most_that_their_cycles_pay_for(bench):
+    for budget in (7000, 11_000):
+        n = choose.most_vectors(budget)
+        assert n in bench.run.LADDER and choose.cycles(n) <= budget < choose.cycles(n + 1)
 
 
 # -- data ----------------------------------------------------------------------------------------------------

@@ -29,11 +29,13 @@ import numpy as np
 from bench_sim import Clock, machine, plain
 from inference_pieces import DEFAULT_N, fitted, kept, model_of, row
 
+from sparsegaze import choose
 from sparsegaze.errors import SparsegazeError
 
 ROOT = Path(__file__).resolve().parents[2]
 SECTIONS = ("frontier", "variance", "identity", "host", "peers", "hard")
-LADDER = (8, 26, 52, 64, 128)  # 26 and 52 are what 7000 and 11,000 cycles pay for
+# Few, what the bars' 7000 and 11,000 cycles pay for, the default of the figures, and all that a slot of the Nano holds.
+LADDER = (8, choose.most_vectors(7000), choose.most_vectors(11_000), DEFAULT_N, choose.ROOM)
 QUICK_LADDER = (16, 64)
 PEER_SETS = ("smooth-0", "smooth-1", "smooth-2", "sim-2000", "sim-2001")
 
