@@ -62,8 +62,7 @@ static uint8_t locked_out;
 uint8_t sense_took;                         // cycles taken, low byte
 static uint16_t late_frames;
 static uint32_t frames;
-static uint16_t took_at;                    // TCNT1, and its wraps
-static uint8_t took_wraps;
+static uint32_t took_at;                    // by now()
 static uint8_t shown_plan = NONE;           // what the reading's exposures and these are of
 static uint16_t mean_to_last, mean_to_end;
 static uint8_t late_shown;
@@ -74,14 +73,10 @@ enum supply { SUPPLY_RESTS, SUPPLY_WANTED, SUPPLY_ASKED };
 static uint8_t supply_of;                   // the cycle that has it makes sense_done this
 static uint8_t supply_code, supply_boot;    // 0: unknown
 
-static uint32_t wraps_at(uint16_t ticks)
-{
-    return sense_wraps + (ticks < sense_base);
-}
-
 static void base_at(uint16_t ticks)
 {
-    sense_wraps = wraps_at(ticks);
+    if (ticks < sense_base)
+        sense_wraps++;
     sense_base = ticks;
 }
 
@@ -99,18 +94,25 @@ static uint16_t ticks_now(void)
     return ticks;
 }
 
-// TCNT1, and how often it wrapped. Read again if the interrupt went on meanwhile, which is off as little as
-// can be: a release may be waiting.
-HOT static uint32_t now(uint16_t *ticks)
+// 32 bits of two halves; by `<< 16 |` they would go through eight registers.
+static inline uint32_t joined(uint16_t high, uint16_t low)
 {
-    uint32_t wraps;
+    const union { uint16_t half[2]; uint32_t whole; } both = { .half = { low, high } };
+    return both.whole;
+}
+
+// Device time in cycles, 32 bits: TCNT1, and how often it wrapped. Read again if the interrupt went on meanwhile,
+// which is off as little as can be: a release may be waiting.
+HOT __attribute__((noinline)) static uint32_t now(void)
+{
+    uint16_t ticks, wraps;
     uint8_t before;
     do {
         before = sense_alive();
-        *ticks = ticks_now();
-        wraps = wraps_at(*ticks);
+        ticks = ticks_now();
+        wraps = (uint16_t)sense_wraps + (ticks < sense_base);
     } while (before != sense_alive());
-    return wraps;
+    return joined(wraps, ticks);
 }
 
 // Of 16-bit pieces, because a shift of 32 bits is a loop.
@@ -118,14 +120,18 @@ static inline uint32_t us_of(uint32_t wraps, uint16_t ticks)
 {
     const uint16_t low = (uint16_t)wraps << 12 | ticks >> 4;
     const uint16_t high = (uint16_t)(wraps >> 16) << 12 | (uint16_t)wraps >> 4;
-    return (uint32_t)high << 16 | low;
+    return joined(high, low);
 }
 
 uint32_t hal_now_us(void)
 {
-    uint16_t ticks;
-    const uint32_t wraps = now(&ticks);
-    return us_of(wraps, ticks);
+    uint32_t wraps;
+    do
+        wraps = sense_wraps;
+    while (wraps != sense_wraps);
+    const uint32_t cycles = now();      // may have wrapped since
+    wraps += (uint16_t)((uint16_t)(cycles >> 16) - (uint16_t)wraps);
+    return us_of(wraps, (uint16_t)cycles);
 }
 
 static struct taken *filling(void)
@@ -164,12 +170,11 @@ SELDOM static void try_supply(void)
 
 HOT uint16_t hal_now_us16(void)
 {
-    uint16_t ticks;
     // Under full load the main loop comes by here alone while a cycle is half over.
     if (supply == SUPPLY_WANTED)
         try_supply();
-    const uint16_t wraps = (uint16_t)now(&ticks);
-    return (uint16_t)(wraps << 12) | ticks >> 4;
+    const uint32_t cycles = now();
+    return (uint16_t)((uint16_t)(cycles >> 16) << 12) | (uint16_t)cycles >> 4;
 }
 
 // A frame whose first cycle's hold is at `hold`, by TCNT1. Called with interrupts off.
@@ -443,7 +448,7 @@ HOT uint8_t sense_take(struct hal_cycle *cycle)
     do {
         done = sense_done;
         from = filling()->other;
-        took_wraps = (uint8_t)now(&took_at);
+        took_at = now();
         wraps = sense_wraps;
     } while (done != sense_done);
     late_frames += (uint8_t)(done - sense_took - 1);
@@ -480,12 +485,9 @@ HOT uint8_t sense_take(struct hal_cycle *cycle)
 
 void sense_taken(void)
 {
-    uint16_t spent;
-    uint8_t wraps = (uint8_t)now(&spent);
-    wraps -= took_wraps + (spent < took_at);
-    spent = wraps ? UINT16_MAX : spent - took_at;
+    const uint32_t spent = now() - took_at;
     if (cycles_max < spent)
-        cycles_max = spent;
+        cycles_max = spent > UINT16_MAX ? UINT16_MAX : (uint16_t)spent;
     late_frames += sense_done != sense_took;
     HAL_END(HAL_SECTION_FRAME);
 }
