@@ -318,7 +318,12 @@ def validate(port, n_targets, seed, csv, png, distance_mm, width_mm, windowed, a
     console = Console(as_json)
     with console.progress() as progress:
         done = module.run(
-            port, n_targets, seed, window=window_of(distance_mm, width_mm, windowed), csv=csv, progress=progress
+            port,
+            n_targets,
+            seed,
+            window=window_of(distance_mm, width_mm, windowed),
+            csv=csv,
+            progress=progress,
         )
     report, rows = done.report(), done.per_target()
     if png:

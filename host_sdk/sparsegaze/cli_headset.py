@@ -52,11 +52,10 @@ def _safety_lines(headset, report):
         )
     else:
         most = 0.99 * max(p.intensity_mw_sr for p in headset.emitters) * report.margin
-        yield "NOT SAFE: %s x the limit (%s, %s) -> emitters of at most %.3g mW/sr: less current, or others" % (
-            _figure(1 / report.margin),
-            report.worst.case,
-            report.worst.quantity,
-            most,
+        over = _figure(1 / report.margin), report.worst.case, report.worst.quantity
+        yield (
+            "NOT SAFE: %s x the limit (%s, %s) -> emitters of at most" % over
+            + " %.3g mW/sr: less current, or others" % most
         )
     for sentence in report.assumed:
         yield "  - " + sentence

@@ -92,8 +92,8 @@ def settings_lines(now, vectors, limits):
             ("rate", f"{now.frame_hz:.1f} Hz of the gaze"),
             (
                 "at most",
-                f"{max(limits['gaze'], int(now.frame_hz))} Hz with {with_model}; {limits['features']} Hz with the features too "
-                f"(stream --csv), {limits['counts']} Hz with --counts",
+                f"{max(limits['gaze'], int(now.frame_hz))} Hz with {with_model}; {limits['features']} Hz "
+                f"with the features too (stream --csv), {limits['counts']} Hz with --counts",
             ),
             ("frame", f"{cycles} of {now.period_us} us{pause}; a frame every {now.frame_period_us} us"),
             ("wiring", now.wiring_text),
@@ -122,8 +122,11 @@ def settings_lines(now, vectors, limits):
     type=click.Choice(["leds", "photodiodes"]),
     help="What is on the pins: LEDs that sense and emit, or photodiodes and emitters of their own.",
 )
-@click.option("--rolling/--no-rolling", default=None, help="A gaze after every two sensors, three a cycle; firmware "
-              "without the time for that, the Nano's, refuses it.")
+@click.option(
+    "--rolling/--no-rolling",
+    default=None,
+    help="A gaze after every two sensors, three a cycle: the Nano's firmware lacks the time, and refuses.",
+)
 @click.option("--lights", type=click.Choice(["on", "off"]), help="off: no LED is lit until switched on.")
 @json_option
 def settings(port, rate, repeats, power, wiring, rolling, lights, as_json):
@@ -192,7 +195,7 @@ def change(device, port, wanted):
         if wanted.get("rolling"):
             raise SparsegazeError(
                 "this firmware gives one gaze a frame: a cycle has no time for three inferences",
-                f"leave --rolling out, nothing was changed; sparsegaze settings {port} --rate max gives the most gazes",
+                f"nothing was changed; the most gazes come by sparsegaze settings {port} --rate max",
             ) from None
         asked = ", ".join(f"{name.replace('_hz', '')} {value}" for name, value in wanted.items())
         raise SparsegazeError(
@@ -233,7 +236,9 @@ def change(device, port, wanted):
 @click.option("--hold", "mode", flag_value="hold", help="Stay at those in force.")
 @click.option("--set", "fixed", type=Microseconds(), help="Hold these: one number for all, or six.")
 @click.option(
-    "--limit", type=Microseconds(none=True), help="Automatic exposure stays at or below these; none: no limit."
+    "--limit",
+    type=Microseconds(none=True),
+    help="Automatic exposure stays at or below these; none: no limit.",
 )
 @json_option
 def exposure(port, mode, fixed, limit, as_json):

@@ -58,7 +58,8 @@ def _rate(status, settings, port):
     from .wire import lib
 
     rate = f"{settings.frame_hz:.1f} Hz of at most {settings.most_hz}"
-    said = f"frames: {status.late_frames} late, {status.tx_dropped} not sent; readings: {status.late_slots} late"
+    said = f"frames: {status.late_frames} late, {status.tx_dropped} not sent; "
+    said += f"readings: {status.late_slots} late"
     late = status.late_frames > max(10, LATE_SHARE * status.frames)
     if late or status.late_slots or status.tx_dropped:
         slower = max(lib.SG_WIRE_RATE_LEAST_HZ, settings.most_hz * 9 // 10)

@@ -65,7 +65,7 @@ class Budget:
 def settings():
     """(name, Timing, whether it sleeps) of the settings that a budget is given for.
 
-    In normal power a slower frame is the mean of more cycles, without a pause: it draws what the fastest does.
+    In normal power a slower frame is the mean of more cycles, without a pause: it draws no less.
     """
     yield "default", Timing(), False
     yield "250 Hz, 4 cycles", Timing(repeats=4), False

@@ -34,7 +34,7 @@ from sparsegaze.errors import SparsegazeError
 
 ROOT = Path(__file__).resolve().parents[2]
 SECTIONS = ("frontier", "variance", "identity", "host", "peers", "hard")
-# Few, what the bars' 7000 and 11,000 cycles pay for, the default of the figures, and all that a slot of the Nano holds.
+# Few; what the bars' 7000 and 11,000 cycles pay for; that of most figures; all that a slot of the Nano holds.
 LADDER = (8, choose.most_vectors(7000), choose.most_vectors(11_000), DEFAULT_N, choose.ROOM)
 QUICK_LADDER = (16, 64)
 PEER_SETS = ("smooth-0", "smooth-1", "smooth-2", "sim-2000", "sim-2001")

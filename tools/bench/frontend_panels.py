@@ -37,7 +37,9 @@ def _persons(axis, rows):
 def _noise(axis, report):
     for row in report["device"]:
         for light, found in row["noise"].items():
-            axis.plot(found["expected"], found["measured"], "o", color=LIGHT_COLOURS[light], ms=4)
+            label = light if row is report["device"][0] else None
+            style = {"color": LIGHT_COLOURS[light], "ms": 4, "label": label}
+            axis.plot(found["expected"], found["measured"], "o", **style)
     most = max(axis.get_xlim()[1], axis.get_ylim()[1])
     axis.plot([0, most], [0, most], "-", color=GREY, lw=1)
     axis.set(
@@ -46,6 +48,7 @@ def _noise(axis, report):
         title="Noise of the six features by the closed form",
     )
     axis.grid(alpha=0.3)
+    axis.legend(fontsize=8)
 
 
 def _ambient(axis, report):
@@ -73,13 +76,17 @@ def _steps(axis, report):
             axis.plot(
                 course[: STEADY.start], color=colour, lw=0.9, label=f"{name} 1000:1" if k == 0 else None
             )
-    axis.axhline(1.1, color=GREY, ls="--", lw=1)
+    axis.axhline(1.1, color="black", ls="--", lw=1)
+    axis.axvline(10, color="black", ls=":", lw=1)
+    ticks = (0.5, 1, 2, 5, 10)
     axis.set(
         xlabel="frame after the step",
         ylabel="error over the new level's",
-        title="Steps of ambient light (gaps: flagged frames)",
+        title="Steps of ambient light (gaps: flagged frames;\ndashes: settled, within 10 frames is the bar)",
         yscale="log",
     )
+    axis.set_yticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+    axis.minorticks_off()
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8)
 
@@ -98,8 +105,9 @@ def _shift(axis, report):
     axis.axhline(1.2, color=ORANGE, ls="--", lw=1)
     axis.axhline(1.0, color=GREEN, ls="--", lw=1)
     _persons(axis, rows)
-    axis.set(ylabel="ratio", title="Flicker of the signal's size; held exposures")
-    axis.legend(fontsize=7)
+    most = max(axis.get_ylim()[1], 1.3)
+    axis.set(ylabel="ratio", title="Flicker of the signal's size; held exposures", ylim=(0, 1.35 * most))
+    axis.legend(fontsize=8, loc="upper center")
 
 
 def _stream(axis, report):
