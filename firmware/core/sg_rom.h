@@ -29,20 +29,31 @@ enum sg_rom_space { SG_ROM_MEMORY = 0, SG_ROM_FLASH = 1 };
 #include <avr/pgmspace.h>
 #define SG_ROM PROGMEM
 
+// Does it lie in flash? A build that has no model anywhere else need not ask.
+static inline uint8_t sg_rom_flash(uint8_t space)
+{
+#ifdef SG_GP_FLASH_ONLY
+    (void)space;
+    return 1;
+#else
+    return space == SG_ROM_FLASH;
+#endif
+}
+
 static inline uint8_t sg_rom_byte(const uint8_t *p, uint8_t space)
 {
-    return space == SG_ROM_FLASH ? pgm_read_byte(p) : *p;
+    return sg_rom_flash(space) ? pgm_read_byte(p) : *p;
 }
 
 // Little-endian fields at any alignment.
 static inline uint16_t sg_rom_u16(const uint8_t *p, uint8_t space)
 {
-    return space == SG_ROM_FLASH ? pgm_read_word(p) : *(const uint16_t *)p;
+    return sg_rom_flash(space) ? pgm_read_word(p) : *(const uint16_t *)p;
 }
 
 static inline uint32_t sg_rom_u32(const uint8_t *p, uint8_t space)
 {
-    return space == SG_ROM_FLASH ? pgm_read_dword(p) : *(const uint32_t *)p;
+    return sg_rom_flash(space) ? pgm_read_dword(p) : *(const uint32_t *)p;
 }
 
 // An entry of a table of the core.
