@@ -19,29 +19,18 @@ _Static_assert((int)SG_HEALTH_OPEN == (int)SG_FAULT_OPEN && (int)SG_HEALTH_SHORT
 _Static_assert((int)SG_EXPOSE_SATURATED_CODE == (int)SG_LIGHT_SATURATED_CODE
                && (int)SG_HEALTH_FULL_CODE == (int)SG_LIGHT_SATURATED_CODE, "one idea of full");
 
-// One row of G g, Q7, rounded: at most 2^14 in size. Q9 times Q7 is Q16, at most 2^22.
-static int16_t gained(const int8_t row_q9[2], const int16_t deg_q7[2])
+// One angle of two, k, corrected. Its row of G g, Q7, rounded, is at most 2^14 in size. Q9 times Q7 is Q16, at most
+// 2^22. Returns 0 if it saturated.
+static __attribute__((noinline)) uint8_t correct(const struct sg_affine *affine, uint8_t k,
+                                                 const int16_t deg_q7[2], int16_t *corrected_q7)
 {
-    const int32_t sum_q16 = (int32_t)row_q9[0] * deg_q7[0] + (int32_t)row_q9[1] * deg_q7[1] + 256;
-    return (int16_t)(sum_q16 >> 9);
-}
-
-// In place. Returns 0 if an angle saturated.
-static uint8_t correct(const struct sg_affine *affine, int16_t deg_q7[2])
-{
-    int16_t more_q7[2] = { 0, 0 };
-    uint8_t whole = 1;
+    const int8_t *row_q9 = affine->gain_q9 + 2 * k;
+    int32_t sum = (int32_t)deg_q7[k] + affine->offset_deg_q7[k];
     // Most devices have no gain.
-    if (affine->gain_q9[0] | affine->gain_q9[1] | affine->gain_q9[2] | affine->gain_q9[3]) {
-        more_q7[0] = gained(affine->gain_q9, deg_q7);
-        more_q7[1] = gained(affine->gain_q9 + 2, deg_q7);
-    }
-    for (uint8_t i = 0; i < 2; i++) {
-        const int32_t sum = (int32_t)deg_q7[i] + affine->offset_deg_q7[i] + more_q7[i];
-        deg_q7[i] = sg_q_sat16(sum);
-        whole &= deg_q7[i] == sum;
-    }
-    return whole;
+    if (row_q9[0] | row_q9[1])
+        sum += (int16_t)(((int32_t)row_q9[0] * deg_q7[0] + (int32_t)row_q9[1] * deg_q7[1] + 256) >> 9);
+    *corrected_q7 = sg_q_sat16(sum);
+    return *corrected_q7 == sum;
 }
 
 int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], uint8_t raw_flags,
@@ -60,7 +49,8 @@ int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], 
         result = sg_gp_predict(view, feature, &point);
         deg_q7[0] = point.deg_q7[0];
         deg_q7[1] = point.deg_q7[1];
-        if (recentre != NULL && !correct(recentre, deg_q7))
+        if (recentre != NULL
+            && !(correct(recentre, 0, point.deg_q7, &deg_q7[0]) & correct(recentre, 1, point.deg_q7, &deg_q7[1])))
             result = SG_E_RANGE;
         flags |= result == SG_OK ? point.flags : (uint8_t)SG_FLAG_OUT_OF_RANGE;
         sigma_log2_q4 = result == SG_OK ? point.sigma_log2_q4 : (uint8_t)SG_GP_SIGMA_HUGE;
