@@ -42,11 +42,12 @@ struct app_state {
     uint8_t pause;                      // between frames
     uint8_t infer_fits;                 // beside that of every frame, one for a request
     uint8_t roomy;                      // beside a frame's work, any request
-    uint8_t fresh;                      // a cycle's work has just been done, and nothing else since
-    uint16_t period_us;                 // of a cycle
+    uint16_t busy_us;                   // from a cycle's last sample until work makes the next frame late
 };
 extern struct app_state app;
 enum { APP_NO_PROBE = 255 };
+// Is there time for so much more work before the next frame is late?
+uint8_t app_time_for(uint8_t us);
 
 // Live state, as it lies in EEPROM. One instance, in app_live.c; who changes it says so by app_live_changed().
 struct app_live {

@@ -10,7 +10,7 @@
 
 // A piece of a check: of the pages so many bytes, else a node or a record. It may make a frame wait.
 // A board may have no room for a trial: what is only for that is then left out.
-enum { TRIAL = HAL_TRIAL_BYTES != 0, SLOTS = TRIAL ? 3 : 2, PIECE_BYTES = 8, PIECES_ROOMY = 6, CRC_FROM = 8 };
+enum { TRIAL = HAL_TRIAL_BYTES != 0, SLOTS = TRIAL ? 3 : 2, PIECE_BYTES = 8, PIECES_ROOMY = 6, PIECE_US = 60, CRC_FROM = 8 };
 
 // A check under way, of slot `slot`, asked for by request `seq`.
 struct check {
@@ -225,7 +225,10 @@ SELDOM uint8_t app_models_finish(void)
 
 void app_models_step(void)
 {
+    if (!check.at || check.at >= check.length || !app_time_for(PIECE_US))
+        return;
     uint8_t pieces = app.roomy ? PIECES_ROOMY : 1;
-    while (check.at && check.at < check.length && pieces--)
+    do {
         step();
+    } while (check.at < check.length && --pieces);
 }

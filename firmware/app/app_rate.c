@@ -132,7 +132,8 @@ SELDOM void app_rate_start(struct hal_timing *timing)
     timing->sleep = app_live.power == SG_POWER_LOW;
     // What is left of the time until the next frame's first cycle is complete.
     const uint16_t spare = frame - times(period, repeats) + period - work_us();
-    app.period_us = period;
+    // The last sample takes a slot of 18 to arrive.
+    app.busy_us = period + (period >> 4) - 6 + COST_REQUEST / CYCLES_PER_US;
     app.infer_fits = !app.sensed || spare >= infer_us();
     app.roomy = !app.sensed || spare >= ROOMY_US;
 }

@@ -12,12 +12,9 @@ enum {
     // out of range a gaze may look right and be wrong.
     RECOVERY_US = 31000,
     BLINK_US = 3900,                    // out of range for so long
-    // A frame's work may end so much later than one period after its last sample for a request still to fit before
-    // readings are lost: the costliest takes 600 us, with what it sends.
-    BEHIND_US = 120,
-    // What comes after the gaze takes about so much longer than the readings were on their way.
-    // Whatever happens, a request is heard after so many cycles.
-    PATIENCE_CYCLES = 40,
+    REQUEST_US = 160,                   // a request, and its answer
+    // Whatever happens, one is heard after so many cycles.
+    PATIENCE_CYCLES = 12,
 };
 
 struct app_state app;
@@ -35,7 +32,7 @@ static uint16_t frame_seq;
 static uint8_t left;                    // cycles still to come
 static uint8_t under_way;
 static uint16_t last_us;                // of the last sample
-static uint8_t refused;                 // a byte came and found no time
+static uint8_t refused;                 // a request came and found no time
 static uint8_t waited;                  // cycles that it has waited
 
 static uint16_t previous_exposure[HAL_CHANNELS];
@@ -84,18 +81,17 @@ NOT_KEPT static uint8_t long_work(void)
     return 1;
 }
 
-// Something that takes a part of a frame's time is begun right after a frame's work, and only if that was not much
-// behind: what made it late before has been caught up with by then, and no frame is ever lost.
-static uint8_t time_for_more(void)
+// What takes a part of a frame's time is begun only if the next frame is not late for it.
+uint8_t app_time_for(uint8_t us)
 {
-    return app.roomy || (app.fresh && (uint16_t)(hal_now_us16() - last_us) < app.period_us + BEHIND_US);
+    return app.roomy || (uint16_t)(hal_now_us16() - last_us) + us < app.busy_us;
 }
 
 uint8_t app_listens(void)
 {
     if (asked.waiting)
         return 0;
-    if (time_for_more() || waited > PATIENCE_CYCLES)
+    if (!app.link.fill || waited > PATIENCE_CYCLES || app_time_for(REQUEST_US))
         return 1;
     refused = 1;
     return 0;
@@ -104,15 +100,14 @@ uint8_t app_listens(void)
 void app_on_byte(uint8_t byte, uint32_t zero_us)
 {
     struct sg_head head;
-    const int n = sg_link_receive(&app.link, byte, &head, app_body.bytes);
-    if (n < 0)
+    if (byte != 0) {
+        sg_link_put(&app.link, byte);
         return;
-    app_request(&head, (uint8_t)n, zero_us);
+    }
     waited = 0;
-    app.fresh = 0;
-    // Inference goes deepest: not from inside of a request.
-    if (app.infer_fits)
-        long_work();
+    const int n = sg_link_end(&app.link, &head, app_body.bytes);
+    if (n >= 0)
+        app_request(&head, (uint8_t)n, zero_us);
 }
 
 // Compared with the frame before, as sensed.
@@ -256,7 +251,6 @@ void app_on_cycle(const struct hal_cycle *cycle)
     if (refused && waited != UINT8_MAX)
         waited++;
     refused = 0;
-    app.fresh = 1;
 }
 
 SELDOM void app_describe(struct sg_hello *hello)
@@ -291,9 +285,7 @@ int main(void)
     while (hal_poll()) {
         if (app.infer_fits)
             long_work();
-        if (time_for_more())
-            app_models_step();
-        app.fresh = 0;
+        app_models_step();
         app_live_step();
     }
     return 0;

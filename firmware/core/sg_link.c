@@ -11,16 +11,18 @@ static void count(uint16_t *counter)
         ++*counter;
 }
 
-int sg_link_receive(struct sg_link_rx *rx, uint8_t byte, struct sg_head *head, void *body)
+void sg_link_put(struct sg_link_rx *rx, uint8_t byte)
 {
     const uint8_t fill = rx->fill;
-    if (byte != 0) {
-        if (fill < sizeof rx->frame)
-            rx->frame[fill] = byte;
-        if (fill <= sizeof rx->frame)  // one past the end marks a frame that is too long
-            rx->fill = (uint8_t)(fill + 1U);
-        return SG_E_BUSY;
-    }
+    if (fill < sizeof rx->frame)
+        rx->frame[fill] = byte;
+    if (fill <= sizeof rx->frame)      // one past the end marks a frame that is too long
+        rx->fill = (uint8_t)(fill + 1U);
+}
+
+int sg_link_end(struct sg_link_rx *rx, struct sg_head *head, void *body)
+{
+    const uint8_t fill = rx->fill;
     rx->fill = 0;
     if (fill == 0)
         return SG_E_BUSY;
@@ -30,6 +32,14 @@ int sg_link_receive(struct sg_link_rx *rx, uint8_t byte, struct sg_head *head, v
     if (result < 0)
         count(result == SG_E_CRC ? &rx->bad_crc : &rx->bad_length);
     return result;
+}
+
+int sg_link_receive(struct sg_link_rx *rx, uint8_t byte, struct sg_head *head, void *body)
+{
+    if (byte == 0)
+        return sg_link_end(rx, head, body);
+    sg_link_put(rx, byte);
+    return SG_E_BUSY;
 }
 
 int sg_link_feed(struct sg_link_rx *rx, const uint8_t *data, size_t n, size_t *used, struct sg_head *head,

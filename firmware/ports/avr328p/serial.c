@@ -35,6 +35,8 @@ static uint8_t after_pending;
 static uint8_t after;
 static uint16_t drained_ticks;
 static uint8_t drained;
+static uint32_t zero_us;                // when the 0x00 that waits arrived
+static uint8_t zero_seen;               // one does, and that is known
 
 ISR(USART_RX_vect, ISR_NAKED)
 {
@@ -202,18 +204,22 @@ uint8_t serial_poll(void)
         return 0;
     while (left-- && rx_tail != rx_head && !after_pending) {
         const uint8_t byte = rx_ring[rx_tail];
-        uint32_t zero_us = 0;
-        // Only a frame's end makes work, and asks for the time; it is less than one turn of the timer ago. With
-        // room for an answer and for as much of the streams, so that none of them is left out for it.
+        // Only a frame's end makes work, and asks for the time; when first looked at it is less than one turn of
+        // the timer ago. With room for an answer and for as much of the streams, so that none of them is left
+        // out for it.
         if (byte == 0) {
+            if (!zero_seen) {
+                zero_seen = 1;
+                uint16_t zero;
+                ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+                    zero = zero_ticks;
+                }
+                const uint32_t now_us = hal_now_us();
+                zero_us = now_us - ((uint16_t)((uint16_t)(now_us << 4) - zero) >> 4);
+            }
             if (!app_listens() || serial_room() < 2 * SG_WIRE_FRAME_MAX)
                 break;
-            uint16_t zero;
-            ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
-                zero = zero_ticks;
-            }
-            const uint32_t now_us = hal_now_us();
-            zero_us = now_us - ((uint16_t)((uint16_t)(now_us << 4) - zero) >> 4);
+            zero_seen = 0;
         }
         rx_tail = (rx_tail + 1) & (RX_RING - 1);
         app_on_byte(byte, zero_us);
