@@ -115,7 +115,7 @@ void app_on_cycle(const struct hal_cycle *cycle);
 // (SG_WIRE_FRAME_MAX) fits into the send queue: what is not delivered waits, so a request is never dropped
 // for want of room for its answer.
 void app_on_byte(uint8_t byte, uint32_t zero_us);
-// Is there time for the next byte? While this is 0 it waits.
-uint8_t app_listens(void);
+// Is there time for this byte, and for some more if it is not 0x00? While this is 0 it waits.
+uint8_t app_listens(uint8_t byte);
 
 #endif

@@ -12,9 +12,10 @@ enum {
     // out of range a gaze may look right and be wrong.
     RECOVERY_US = 31000,
     BLINK_US = 3900,                    // out of range for so long
-    REQUEST_US = 160,                   // a request, and its answer
+    BYTES_US = 130,                     // a look at the line
+    REQUEST_US = 188,                   // a request, and its answer
     // Whatever happens, one is heard after so many cycles.
-    PATIENCE_CYCLES = 12,
+    PATIENCE_CYCLES = 6,
 };
 
 struct app_state app;
@@ -87,11 +88,11 @@ uint8_t app_time_for(uint8_t us)
     return app.roomy || (uint16_t)(hal_now_us16() - last_us) + us < app.busy_us;
 }
 
-uint8_t app_listens(void)
+uint8_t app_listens(uint8_t byte)
 {
     if (asked.waiting)
         return 0;
-    if (!app.link.fill || waited > PATIENCE_CYCLES || app_time_for(REQUEST_US))
+    if (waited > PATIENCE_CYCLES || app_time_for(byte || !app.link.fill ? BYTES_US : REQUEST_US))
         return 1;
     refused = 1;
     return 0;

@@ -146,9 +146,11 @@ int16_t sg_light_meant(struct sg_light *light, const struct sg_reading *reading,
         channel->flags |= SG_LIGHT_SATURATED;
     const uint8_t late_lit = reading->late_lit_cycles[i], late_unlit = reading->late_unlit_cycles[i];
     // A neighbour released late brought less than usual.
-    const int16_t lacking = high(pass->unlit_more_q5, SHARE_Q16);
-    unlit_q5 = (uint16_t)(unlit_q5 + as_code(lacking, unlit_q5));
-    int16_t missed = (int16_t)-high(pass->missed_q5, SHARE_Q16), more = 0;
+    if (pass->unlit_more_q5)
+        unlit_q5 = (uint16_t)(unlit_q5 + as_code(high(pass->unlit_more_q5, SHARE_Q16), unlit_q5));
+    int16_t missed = 0, more = 0;
+    if (pass->missed_q5)
+        missed = (int16_t)-high(pass->missed_q5, SHARE_Q16);
     if (late_lit)
         missed = (int16_t)(missed + missed_q5(channel, lit, pass->lit_code, late_lit));
     if (late_unlit) {

@@ -18,11 +18,11 @@ HOT static inline void crc16_byte(struct crc *crc, uint8_t byte)
     crc->low = (uint8_t)(q ^ (uint8_t)(q << 5));
 }
 
-uint16_t sg_wire_crc16(uint16_t crc, const uint8_t *data, size_t n)
+HOT uint16_t sg_wire_crc16(uint16_t crc, const uint8_t *data, size_t n)
 {
     struct crc now = { .high = (uint8_t)(crc >> 8), .low = (uint8_t)crc };
-    for (size_t i = 0; i < n; i++)
-        crc16_byte(&now, data[i]);
+    for (const uint8_t *end = data + n; data != end;)
+        crc16_byte(&now, *data++);
     return (uint16_t)(((uint16_t)now.high << 8) | now.low);
 }
 
@@ -82,28 +82,31 @@ int sg_wire_encode(const struct sg_head *head, const void *body, size_t body_byt
     return sg_wire_encode_ring(head, body, (uint8_t)body_bytes, out, SG_WIRE_FRAME_MAX + 1, 0);
 }
 
-int sg_wire_decode(uint8_t *frame, size_t n, struct sg_head *head, void *body)
+HOT int sg_wire_decode(uint8_t *frame, size_t n, struct sg_head *head, void *body)
 {
+    const uint8_t *at = frame, *const end = frame + n;
     uint8_t *packet = frame;    // never gets ahead: a group has one byte more than what it stands for
-    uint8_t fill = 0;
-    size_t at = 0;
-    while (at < n) {
-        const uint8_t code = frame[at++];
+    uint8_t *const full = packet + SG_WIRE_PACKET_MAX;
+    uint8_t *to = packet;
+    while (at != end) {
+        uint8_t code = *at++;
         if (code == 0)
             return SG_E_BOUNDS;
-        if ((size_t)(code - 1U) > n - at)
+        if ((size_t)(code - 1U) > (size_t)(end - at))
             return SG_E_SHORT;
-        for (uint8_t i = 1; i < code; i++) {
-            if (frame[at] == 0 || fill == SG_WIRE_PACKET_MAX)
+        while (--code != 0) {
+            const uint8_t byte = *at++;
+            if (byte == 0 || to == full)
                 return SG_E_BOUNDS;
-            packet[fill++] = frame[at++];
+            *to++ = byte;
         }
-        if (at < n) {  // between two groups stands a zero
-            if (fill == SG_WIRE_PACKET_MAX)
+        if (at != end) {  // between two groups stands a zero
+            if (to == full)
                 return SG_E_BOUNDS;
-            packet[fill++] = 0;
+            *to++ = 0;
         }
     }
+    const uint8_t fill = (uint8_t)(to - packet);
     if (fill < SG_WIRE_HEAD_BYTES + 2)
         return SG_E_SHORT;
     const uint8_t body_bytes = (uint8_t)(fill - SG_WIRE_HEAD_BYTES - 2);

@@ -200,7 +200,7 @@ uint8_t serial_poll(void)
     send_on();
     if (after_pending)
         carry_out();
-    if (rx_tail == rx_head)
+    if (rx_tail == rx_head || !app_listens(1))
         return 0;
     while (left-- && rx_tail != rx_head && !after_pending) {
         const uint8_t byte = rx_ring[rx_tail];
@@ -217,7 +217,7 @@ uint8_t serial_poll(void)
                 const uint32_t now_us = hal_now_us();
                 zero_us = now_us - ((uint16_t)((uint16_t)(now_us << 4) - zero) >> 4);
             }
-            if (!app_listens() || serial_room() < 2 * SG_WIRE_FRAME_MAX)
+            if (!app_listens(0) || serial_room() < 2 * SG_WIRE_FRAME_MAX)
                 break;
             zero_seen = 0;
         }

@@ -58,7 +58,7 @@ uint8_t serial_poll(void)
         if (after == HAL_AFTER_REBOOT)
             boot_restart();             // a change of speed changes nothing here: no bit takes any time
     }
-    for (uint8_t i = 0; i < BYTES_PER_POLL && app_listens() && room() >= SG_WIRE_FRAME_MAX; i++) {
+    for (uint8_t i = 0; i < BYTES_PER_POLL && app_listens(0) && room() >= SG_WIRE_FRAME_MAX; i++) {
         if (!(UART_STATE(UART_LINE) & UART_STATE_RX_FULL))
             break;
         const uint8_t byte = (uint8_t)UART_DATA(UART_LINE);
