@@ -6,7 +6,7 @@ from scipy.optimize import linprog
 
 from .model import S_FRAC, S_MAX, U_STEPS
 
-KERNEL_ERROR = 4.0  # of a device kernel value, Q0.16 steps, S2's rounding included (sg_gp.h)
+KERNEL_ERROR = 10.0  # of a device kernel value, Q0.16 steps, S2's rounding included (sg_gp.h)
 CELLS_MAX = 200_000  # that are looked at before the proof is given up
 BLOCK = 500
 CUBE = np.sqrt(15.0) / 6.0

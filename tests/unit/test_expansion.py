@@ -6,14 +6,22 @@ import pytest
 
 from sparsegaze import rounding
 from sparsegaze.expansion import Expansion, Problem
-from sparsegaze.model import kernel_q16, weighed
-from sparsegaze.reach import reach
+from sparsegaze.model import half_squares, kernel_q16, weighed
+from sparsegaze.reach import KERNEL_ERROR, reach
 from sparsegaze.trust import Trust
 
 
 def slabs(least, most, rows=63 * np.eye(6, dtype=int)):
     none = np.zeros(len(rows), int)
     return Trust(rows, none, none + least, none + most, np.zeros((2, 2, len(rows)), int))
+
+
+def test_no_kernel_value_is_further_from_the_exponential_than_the_proof_believes():
+    s, centres = np.arange(4096)[:, None], np.arange(256)[:, None]
+    exact = s * s / 32.0 + 256 * half_squares(centres) - s * centres.T
+    error = kernel_q16(s, centres) - 65536 * np.exp(-exact / 65536)
+    print("kernel: %.2f to %.2f steps of 2^-16" % (error.min(), error.max()))
+    assert 0.5 * KERNEL_ERROR < np.abs(error).max() <= KERNEL_ERROR
 
 
 def test_reach_is_tight_for_one_kernel_cancelling_kernels_and_a_trend():
