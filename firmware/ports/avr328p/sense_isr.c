@@ -117,7 +117,8 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "rjmp sense_leave" "\n"
         "3:" "\t"
         "cpi r25, %[cycles] + 1" "\n\t"
-        "brsh sense_due" "\n"
+        "brlo sense_exit" "\n\t"
+        "rjmp sense_due" "\n"
         "sense_exit:" "\t"
         "lds r25, %[state]" "\n\t"
         "sbrc r25, %[came]" "\n\t"
@@ -163,20 +164,26 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "out __SREG__, r30" "\n\t"
         "pop r30" "\n\t"
         "reti" "\n"
-        "sense_due:" "\t"
+        "8:" "\t" "rcall sense_byte" "\n"
+        "sense_soon:" "\t"                      // too soon to return first
+        "lds r24, %[state]" "\n\t"
+        "sbrc r24, %[came]" "\n\t"
+        "rjmp 8b" "\n\t"
+        "sbis %[flags], %[due]" "\n\t"
+        "rjmp sense_soon" "\n"
+        "9:" "\t"
+        "ldi r24, 1 << %[due]" "\n\t"
+        "out %[flags], r24" "\n\t"
+        "rjmp sense_next" "\n"
+        "sense_due:" "\t"                       // the flag need not have come up
         "inc r25" "\n\t"
         "breq 8f" "\n\t"
         "rjmp sense_missed" "\n"               // 256 cycles ago and more
-        "sense_soon:" "\t"                      // too soon to return first
-        "sbis %[flags], %[due]" "\n\t"
-        "rjmp sense_soon" "\n"
         "8:" "\t"
-        "ldi r24, 1 << %[due]" "\n\t"
-        "out %[flags], r24" "\n\t"
         "lds r24, %[state]" "\n\t"
-        "sbrs r24, %[came]" "\n\t"
-        "rjmp sense_next" "\n\t"
-        "rjmp sense_receive_next" "\n\t"
+        "sbrc r24, %[came]" "\n\t"
+        "rcall sense_byte" "\n\t"
+        "rjmp 9b" "\n\t"
         : : [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [soon] "M"(SOON_CYCLES),
           [keep] "M"(EVENT_STORE | EVENT_COMPLETE), [out] "i"(&sense_out), [adc] "i"(_SFR_MEM_ADDR(ADCL)),
           [trigger] "i"(_SFR_MEM_ADDR(OCR1BL)), [slot] "i"(&sense_slot), [matched] "I"(OCF1B),
@@ -488,14 +495,10 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
                      "lds r24, %[match]" "\n\t"
                      "lds r25, %[match]+1" "\n\t"
                      "rjmp sense_when" "\n"
-                     "sense_receive_next:" "\t"
-                     "rcall sense_byte" "\n\t"
-                     "rjmp sense_next" "\n"
                      "sense_receive:" "\t"
                      "rcall sense_byte" "\n\t"
                      "rjmp sense_exit" "\n"
                      "sense_byte:" "\t"
-                     : : [match] "i"(_SFR_MEM_ADDR(OCR1AL)));
-    serial_receive();
-    __asm__ volatile("ret" "\n\t");
+                     "jmp %x[receive]"
+                     : : [match] "i"(_SFR_MEM_ADDR(OCR1AL)), [receive] "i"(serial_byte));
 }

@@ -38,6 +38,14 @@ static uint8_t drained;
 static uint32_t zero_us;                // when the 0x00 that waits arrived
 static uint8_t zero_seen;               // one does, and that is known
 
+// Takes the byte and a place in the ring, then lets other interrupts in: a release waits for half of this, not
+// for all. What they receive comes behind it, and nobody looks at the ring before this has ended. In assembler
+// because the compiler's prologue would cost as much again.
+#define TAKE_BYTE                                                                                       \
+    "lds r30, %[head]" "\n\t" "mov r24, r30" "\n\t" "inc r24" "\n\t" "andi r24, %[mask]" "\n\t"         \
+    "lds r25, %[tail]" "\n\t" "cpse r24, r25" "\n\t" "sts %[head], r24" "\n\t"                        \
+    "lds r24, %[status]" "\n\t" "lds r25, %[data]" "\n\t"
+
 ISR(USART_RX_vect, ISR_NAKED)
 {
     __asm__ volatile("push r24" "\n\t"
@@ -45,12 +53,13 @@ ISR(USART_RX_vect, ISR_NAKED)
                      "push r24" "\n\t"
                      "push r25" "\n\t"
                      "push r30" "\n\t"
+                     TAKE_BYTE
+                     "sei" "\n\t"
                      "push r31" "\n\t"
-                     "ldi r24, %[begin]" "\n\t"
-                     "out %[mark], r24"
-                     : : [begin] "M"(2 * HAL_SECTION_SERIAL + 1), [mark] "I"(_SFR_IO_ADDR(GPIOR0)));
-    serial_receive();
-    __asm__ volatile("ldi r24, %[end]" "\n\t"
+                     "ldi r31, %[begin]" "\n\t"
+                     "out %[mark], r31" "\n\t"
+                     "rcall serial_keep" "\n\t"
+                     "ldi r24, %[end]" "\n\t"
                      "out %[mark], r24" "\n\t"
                      "pop r31" "\n\t"
                      "pop r30" "\n\t"
@@ -58,12 +67,50 @@ ISR(USART_RX_vect, ISR_NAKED)
                      "pop r24" "\n\t"
                      "out __SREG__, r24" "\n\t"
                      "pop r24" "\n\t"
-                     "reti"
-                     : : [end] "M"(2 * HAL_SECTION_SERIAL + 2), [mark] "I"(_SFR_IO_ADDR(GPIOR0)));
+                     "reti" "\n"
+                     ".global serial_byte" "\n"
+                     "serial_byte:" "\t"
+                     TAKE_BYTE "\n"
+                     "serial_keep:" "\t"
+                     "sbrc r24, %[overrun]" "\n\t"
+                     "rcall 3f" "\n\t"
+                     "mov r24, r30" "\n\t"
+                     "inc r24" "\n\t"
+                     "andi r24, %[mask]" "\n\t"
+                     "lds r31, %[tail]" "\n\t"
+                     "cp r24, r31" "\n\t"
+                     "breq 3f" "\n\t"               // no room: the byte is lost
+                     "ldi r31, 0" "\n\t"
+                     "subi r30, lo8(-(%[ring]))" "\n\t"
+                     "sbci r31, hi8(-(%[ring]))" "\n\t"
+                     "st Z, r25" "\n\t"
+                     "tst r25" "\n\t"
+                     "brne 4f" "\n\t"
+                     "in r31, __SREG__" "\n\t"
+                     "cli" "\n\t"
+                     "lds r24, %[ticks]" "\n\t"
+                     "lds r25, %[ticks]+1" "\n\t"
+                     "sts %[zero]+1, r25" "\n\t"
+                     "sts %[zero], r24" "\n\t"
+                     "out __SREG__, r31" "\n"
+                     "4:" "\t" "ret" "\n"
+                     "3:" "\t"
+                     "lds r24, %[overruns]" "\n\t"
+                     "lds r31, %[overruns]+1" "\n\t"
+                     "subi r24, 0xFF" "\n\t"
+                     "sbci r31, 0xFF" "\n\t"
+                     "sts %[overruns]+1, r31" "\n\t"
+                     "sts %[overruns], r24" "\n\t"
+                     "ret"
+                     : : [begin] "M"(2 * HAL_SECTION_SERIAL + 1), [end] "M"(2 * HAL_SECTION_SERIAL + 2),
+                     [mark] "I"(_SFR_IO_ADDR(GPIOR0)), [status] "i"(_SFR_MEM_ADDR(UCSR0A)),
+                     [data] "i"(_SFR_MEM_ADDR(UDR0)), [overrun] "i"(DOR0), [overruns] "i"(&rx_overruns),
+                     [head] "i"(&rx_head), [tail] "i"(&rx_tail), [mask] "i"(RX_RING - 1),
+                     [ring] "i"(rx_ring), [ticks] "i"(_SFR_MEM_ADDR(TCNT1L)), [zero] "i"(&zero_ticks)
+                     : "memory");
 }
 
-// Sends up to tx_mark, then leaves the rest to the polling. In assembler for the same reason as
-// serial_receive().
+// Sends up to tx_mark, then leaves the rest to the polling. In assembler for the same reason.
 ISR(USART_UDRE_vect, ISR_NAKED)
 {
     __asm__ volatile("push r24" "\n\t"
