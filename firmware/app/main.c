@@ -14,8 +14,10 @@ enum {
     BLINK_US = 3900,                    // out of range for so long
     BYTES_US = 130,                     // a look at the line
     REQUEST_US = 188,                   // a request, and its answer
-    // Whatever happens, one is heard after so many cycles.
+    // One that makes a frame late is heard after so many cycles, if no frame is late yet: it takes 500 us, and
+    // readings are lost when work is behind by a whole period.
     PATIENCE_CYCLES = 6,
+    PATIENCE_MOST_CYCLES = 40,          // whatever happens
 };
 
 struct app_state app;
@@ -24,7 +26,7 @@ struct app_state app;
 static struct {
     struct sg_infer point;
     uint16_t seq;
-    uint8_t waiting;
+    uint8_t waiting;                    // 0: none; and cycles that it has waited, in a stream
 } asked;
 
 // The frame under way.
@@ -92,7 +94,8 @@ uint8_t app_listens(uint8_t byte)
 {
     if (asked.waiting)
         return 0;
-    if (waited > PATIENCE_CYCLES || app_time_for(byte || !app.link.fill ? BYTES_US : REQUEST_US))
+    if (app_time_for(byte || !app.link.fill ? BYTES_US : REQUEST_US)
+        || (waited > PATIENCE_CYCLES && (waited > PATIENCE_MOST_CYCLES || app_time_for(0))))
         return 1;
     refused = 1;
     return 0;
@@ -241,7 +244,10 @@ void app_on_cycle(const struct hal_cycle *cycle)
         if (last && app.stream)
             app_count(&app.status.tx_dropped);
     } else {
-        if (last && !long_work())
+        const uint8_t put_off = app.stream && asked.waiting && asked.waiting < PATIENCE_MOST_CYCLES;
+        if (put_off)
+            asked.waiting++;
+        if (last && (put_off || !long_work()))
             finish_frame(cycle);
         else if (last && app.stream)
             app_count(&app.status.tx_dropped);
@@ -284,7 +290,7 @@ int main(void)
 {
     start();
     while (hal_poll()) {
-        if (app.infer_fits)
+        if (app.infer_fits || (asked.waiting && app_time_for(0)))
             long_work();
         app_models_step();
         app_live_step();
