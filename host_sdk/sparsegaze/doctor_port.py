@@ -6,6 +6,9 @@ from .doctor import Check
 from .errors import SparsegazeError
 
 SETTLE_S = 1.5  # after a reset: exposures find their level, faults show
+LOOK_S = 0.3
+MANY = 3  # sensors at fault together have a common cause
+WRONG_READINGS = 1.0  # of the six in a frame that are too dark, or full
 LATE_SHARE = 0.02  # of all frames: more of them late is worth a word
 
 
@@ -16,13 +19,15 @@ def examine(port):
     try:
         with Device(port) as device:
             device.link.sleep(SETTLE_S)
-            return checks_of(device, port)
+            before = device.status()
+            device.link.sleep(LOOK_S)
+            return checks_of(device, port, before)
     except SparsegazeError as error:
         return [Check("board", False, error.message, error.remedy)]
 
 
-def checks_of(device, port):
-    """The checks of an open device."""
+def checks_of(device, port, before):
+    """The checks of an open device; before: its Status of a moment ago."""
     from .wire import lib
 
     hello, status, settings, info = device.hello, device.status(), device.settings(), device.model_info()
@@ -33,8 +38,12 @@ def checks_of(device, port):
     checks += [Check("lights", False, fault.text, fault.remedy) for fault in dark]
     channels = [fault for fault in found if fault.channel is not None]
     checks += [Check(f"pin A{fault.channel}", False, fault.text, fault.remedy) for fault in channels]
-    if not channels:
-        checks.append(Check("sensors", True, "all six read"))
+    if len(channels) >= MANY:
+        other = "photodiodes" if settings.wiring_text == "leds" else "leds"
+        remedy = f"the rail, if so many are at fault; or sparsegaze settings {port} --wiring {other}"
+        checks.append(Check("wiring", None, f"set to {settings.wiring_text}", remedy))
+    if not channels and not dark:
+        checks.append(_sensors(status, before, settings, port))
     if info.active == lib.SG_SLOT_NONE:
         checks.append(Check("model", None, "none", f"sparsegaze calibrate {port}"))
     else:
@@ -51,6 +60,28 @@ def checks_of(device, port):
         remedy = "use another USB port" if weak else f"sparsegaze flash {port}"
         checks.append(Check("last start", None, f"by {status.reset_text}", remedy))
     return checks
+
+
+def _sensors(status, before, settings, port):
+    """Too dark or too bright now, which is no fault of a part: nothing before the headset, or wired otherwise."""
+    frames = max(status.frames - before.frames, 1)
+    starved, full = (
+        (getattr(status, name) - getattr(before, name) & 0xFFFF) / frames
+        for name in ("starved", "saturated")
+    )
+    if starved < WRONG_READINGS and full < WRONG_READINGS:
+        return Check("sensors", True, "all six read")
+    if starved >= full:
+        return Check(
+            "sensors",
+            None,
+            f"hardly any light comes back to {min(starved, 6):.0f} of six",
+            f"put the headset on, or white paper before it; it is set to {settings.wiring_text}: "
+            f"if that is wrong, sparsegaze settings {port} --wiring",
+        )
+    return Check(
+        "sensors", None, f"too much light for {min(full, 6):.0f} of six", "shade the headset from the sun"
+    )
 
 
 def _rate(status, settings, port):

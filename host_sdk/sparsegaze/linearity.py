@@ -85,12 +85,8 @@ def run(device, progress=None):
     settings, exposure = device.settings(), device.exposure()
     stored = device.curve()
     old, changed = np.array(stored.curve), False
-    # The counts are of a frame's last cycle; and both streams must fit on the line.
-    ours = {"rate_hz": min(settings.rate_hz, RATE_HZ), "repeats": 1, "rolling": False}
-    if any(getattr(settings, name) != value for name, value in ours.items()):
-        device.settings(**ours)
-    else:
-        ours = None
+    # Frames enough in HOLD_US, however slowly the device is set to sense; both streams must fit on the line.
+    device.settings(rate_hz=RATE_HZ, repeats=1, rolling=False, power="normal")
     try:
         device.set_stream(raw=True, counts=True)
         long_us = _settle(device, progress)
@@ -120,8 +116,7 @@ def run(device, progress=None):
         else:
             device.exposure(us=exposure.exposure_us)
         device.set_stream()
-        if ours:
-            device.settings_back(settings)
+        device.settings_back(settings)
         device.link.sleep(EXPOSURE_REST_S)
         wait_stored(device, written)
 
@@ -157,7 +152,7 @@ def check_steady(holds):
     """Raise CalibrationError when our light was too weak, or the light around was not steady."""
     long = [hold for hold in holds if hold.full]
     if len(long) < 4:
-        raise CalibrationError("too few frames came", "check the cable and `sparsegaze status PORT`")
+        raise CalibrationError("too few frames came", "check the cable; `sparsegaze status` names what is wrong")
     rate = np.array([hold.unlit / hold.exposure_us for hold in long])
     own = np.maximum(np.median([(hold.lit - hold.unlit) / hold.exposure_us for hold in long], axis=0), 0.1)
     low, high = np.quantile(rate, [0.02, 0.98], axis=0)

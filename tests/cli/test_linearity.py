@@ -39,6 +39,25 @@ def test_finds_every_curve_and_takes_the_shift_away(wander, ambient):
     assert device.automatic and device.stream[-1] == (False, False, False)
 
 
+class Paced(BentSensor):
+    """Its frames come as fast as its settings say."""
+
+    def settings(self, **wanted):
+        now = super().settings(**wanted)
+        self.frame_us = round(1e6 / now.rate_hz)
+        return now
+
+
+@pytest.mark.parametrize("slow", [{"rate_hz": 60, "power": "low"}, {"repeats": 16}], ids=["60 Hz", "16 cycles"])
+def test_a_board_that_is_set_to_sense_slowly_is_measured_fast_and_stays_slow(slow):
+    device = Paced(BEND)
+    device.settings(**slow)
+    before = dict(device.sensing)
+    done = linearity.run(device)
+    assert done.kept and np.abs(done.curve - BEND).max() < 0.004
+    assert device.sensing == before
+
+
 @pytest.mark.parametrize("zero", [-2.0, 2.0])
 def test_a_converter_whose_zero_is_off_is_not_taken_for_curvature(zero):
     device = BentSensor(BEND, wander=drift, zero=zero, frame_us=1999)

@@ -174,6 +174,32 @@ def test_a_board_that_is_well(command, command_json, fake):
     assert "no fault" in command("status", "PORT")[1]
 
 
+@pytest.mark.parametrize(
+    "name, text, remedy",
+    [("starved", "hardly any light comes back to 4 of six", "set to leds"),
+     ("saturated", "too much light for 4 of six", "shade")],
+)
+def test_a_board_that_sees_nothing_is_not_said_to_read(command, fake, monkeypatch, name, text, remedy):
+    device, asked = fake(linear_model()), iter(range(9))
+    plain = device.status()
+
+    def status():
+        k = next(asked)     # counters wrap between the two looks
+        return plain._replace(frames=1000 + 300 * k, **{name: (65000 + 1200 * k) % 65536})
+
+    monkeypatch.setattr(device, "status", status)
+    code, out, _ = command("doctor", "PORT")
+    assert code == 0 and text in out and remedy in out and "all six read" not in out
+
+
+def test_many_open_sensors_point_to_the_rail_and_to_the_wiring_that_is_set(command, fake):
+    fake(linear_model(), fault=(0, 1, 0, 1, 1, 1))
+    code, out, _ = command("doctor", "PORT")
+    assert code == 1 and "set to leds" in out and "the rail" in out and "--wiring photodiodes" in out
+    fake(linear_model(), fault=(0, 1, 0, 1, 0, 0))
+    assert "wiring" not in command("doctor", "PORT")[1]
+
+
 @pytest.mark.parametrize("late, name", [(3, "ok "), (90, "note")])
 def test_a_few_late_frames_are_ordinary_and_many_are_worth_a_slower_rate(
     command, fake, monkeypatch, late, name
