@@ -63,7 +63,7 @@ def checks_of(device, port, before):
 
 
 def _sensors(status, before, settings, port):
-    """Too dark or too bright now, which is no fault of a part: nothing before the headset, or wired otherwise."""
+    """Too dark or too bright now, which is no part's fault: nothing before the headset, or other wiring."""
     frames = max(status.frames - before.frames, 1)
     starved, full = (
         (getattr(status, name) - getattr(before, name) & 0xFFFF) / frames
