@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What README.md tells a newcomer to type is there and runs."""
+"""What README.md and the other documents tell one to type, or to read, is there and runs."""
 
 import re
 
@@ -30,6 +30,27 @@ def test_every_command_and_option_of_the_readme_exists(readme):
         assert told.exit_code == 0, words
         for option in (word for word in words if word.startswith("-")):
             assert option in told.output, words
+
+
+DOCUMENTS = ["DESIGN.md", "PROTOCOL.md", "CHANGELOG.md", "headsets/led2gaze.toml", "headsets/nextgaze_nano.toml"]
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_every_command_of_the_other_documents_exists(name, repo_root):
+    for words in commands_of((repo_root / name).read_text(encoding="utf-8")):
+        told = CliRunner().invoke(cli, [words[0].rstrip(","), "--help"])
+        assert told.exit_code == 0, words
+        for option in (word for word in words if word.startswith("--")):
+            assert option in told.output, words
+
+
+@pytest.mark.parametrize("name", ["README.md", "DESIGN.md", "PROTOCOL.md", "CHANGELOG.md"])
+def test_every_target_and_file_that_a_document_names_exists(name, repo_root):
+    text, makefile = (repo_root / name).read_text(encoding="utf-8"), (repo_root / "Makefile").read_text()
+    targets = re.findall(r"(?:^    |`)make ([a-z][\w-]*)", text, re.M)
+    assert [target for target in targets if not re.search(rf"^{target}:", makefile, re.M)] == []
+    files = re.findall(r"`((?:firmware|host_sdk|tools|tests|headsets|persons|sim_c)/[\w./-]+\.\w+)`", text)
+    assert [file for file in files if not (repo_root / file).is_file()] == []
 
 
 def test_a_command_that_does_not_exist_would_be_seen():
