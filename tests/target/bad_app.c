@@ -67,8 +67,9 @@ static void report(void)
     answer(SG_MSG_STATUS | SG_REPLY, &status, sizeof status);
 }
 
-uint8_t app_listens(void)
+uint8_t app_listens(uint8_t byte)
 {
+    (void)byte;
     return 1;
 }
 

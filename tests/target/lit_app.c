@@ -25,8 +25,9 @@ void app_on_cycle(const struct hal_cycle *cycle)
 #endif
 }
 
-uint8_t app_listens(void)
+uint8_t app_listens(uint8_t byte)
 {
+    (void)byte;
     return 1;
 }
 

@@ -317,11 +317,14 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
           [state] "i"(_SFR_MEM_ADDR(UCSR0A)), [came] "I"(RXC0), [alone] "M"(EVENT_ALONE));
     __asm__ volatile(
         "sense_complete:" "\t"                  // Z behind the last code, r24 and r25 free
+        "lds r24, %[state]" "\n\t"            // this takes long
+        "sbrc r24, %[came]" "\n\t"
+        "rcall sense_byte_z" "\n\t"
         "push r28" "\n\t"
         "push r29" "\n\t"
         "lds r24, %[trigger]" "\n\t"
         "lds r25, %[trigger]+1" "\n\t"
-        "lds r28, %[slot]" "\n\t"              // armed first: this takes long
+        "lds r28, %[slot]" "\n\t"              // armed first
         "lds r29, %[slot]+1" "\n\t"
         "add r28, r24" "\n\t"
         "adc r29, r25" "\n\t"
@@ -371,7 +374,7 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
           [current] "i"(&sense_current), [list_low] "I"(_SFR_IO_ADDR(OCR0A)),
           [list_high] "I"(_SFR_IO_ADDR(OCR0B)),
           [plan] "i"(sense_plan), [plan_bytes] "i"(sizeof(struct plan)), [drop] "i"(&sense_drop),
-          [turn] "i"(&sense_turn));
+          [turn] "i"(&sense_turn), [state] "i"(_SFR_MEM_ADDR(UCSR0A)), [came] "I"(RXC0));
     __asm__ volatile(
         "lds r24, %[seq]" "\n\t"
         "lds r25, %[seq]+1" "\n\t"
@@ -484,12 +487,15 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
           [list_high] "I"(_SFR_IO_ADDR(OCR0B)));
     // The receiver holds no more than comes while a release is waited for.
     __asm__ volatile("sense_receive_first:" "\t"
+                     "rcall sense_byte_z" "\n\t"
+                     "rjmp sense_wait_lit" "\n"
+                     "sense_byte_z:" "\t"               // the same, and Z stays
                      "push r30" "\n\t"
                      "push r31" "\n\t"
                      "rcall sense_byte" "\n\t"
                      "pop r31" "\n\t"
                      "pop r30" "\n\t"
-                     "rjmp sense_wait_lit" "\n"
+                     "ret" "\n"
                      "sense_receive_then:" "\t"
                      "rcall sense_byte" "\n\t"
                      "lds r24, %[match]" "\n\t"
