@@ -66,8 +66,7 @@ def _sensors(status, before, settings, port):
     """Too dark or too bright now, which is no part's fault: nothing before the headset, or other wiring."""
     frames = max(status.frames - before.frames, 1)
     starved, full = (
-        (getattr(status, name) - getattr(before, name) & 0xFFFF) / frames
-        for name in ("starved", "saturated")
+        (getattr(status, name) - getattr(before, name)) / frames for name in ("starved", "saturated")
     )
     if starved < WRONG_READINGS and full < WRONG_READINGS:
         return Check("sensors", True, "all six read")
