@@ -17,31 +17,42 @@ import click
 from . import __version__
 from .errors import SparsegazeError
 
-# name: (module, what it does in one line), in the order in which one uses them
-COMMANDS = {
-    "doctor": ("cli_device", "What is installed; what is wrong with a board or a headset."),
-    "list": ("cli_device", "Ports and devices, virtual ones too."),
-    "map": ("cli_map", "What each sensor receives over gaze, on a simulated person."),
-    "view": ("cli_view", "What one sensor sees of a simulated eye, as a picture."),
-    "study": ("cli_study", "Maps of many placements on many people, resumable."),
-    "virtual": ("cli_device", "Run a virtual Nano: prints its port, runs until stopped."),
-    "flash": ("cli_device", "Put the firmware on a board and read it back."),
-    "info": ("cli_device", "Versions, limits, counters, exposures and stored models."),
-    "status": ("cli_health", "Is the board well: faults by name, with what to do."),
-    "settings": ("cli_sense", "Frame rate, averaging, power, wiring, lights."),
-    "exposure": ("cli_sense", "The six exposure times: automatic, held, set, limited."),
-    "linearity": ("cli_health", "Self-calibration of the sensors' linearity."),
-    "probe": ("cli_health", "Who sees whom: names swapped, dead and covered LEDs."),
-    "calibrate": ("cli_gaze", "Targets, recording, fit, upload and validation in one go."),
-    "record": ("cli_gaze", "Record raw features while targets are shown."),
-    "fit": ("cli_gaze", "Make a model from a recording (no device needed)."),
-    "predict": ("cli_predict", "A model's answers from a target's own binary, with its cycles."),
-    "upload": ("cli_device", "Put a model into the device, safe against power cuts."),
-    "validate": ("cli_gaze", "Measure the device's gaze on held-out targets."),
-    "recentre": ("cli_recentre", "Put a shifted headset right with one look at the centre, or a few."),
-    "stream": ("cli_stream", "The gaze computed on the device, live."),
-    "replay": ("cli_stream", "The device's arithmetic on the host, over a recording, to the bit."),
+# title: {name: (module, what it does in one line)}, in the order in which one uses them
+GROUPS = {
+    "To begin with": {
+        "doctor": ("cli_device", "What is installed; what is wrong with a board or a headset."),
+        "list": ("cli_device", "Ports and devices, virtual ones too."),
+        "virtual": ("cli_device", "Run a virtual Nano: prints its port, runs until stopped."),
+        "flash": ("cli_device", "Put the firmware on a board and read it back."),
+    },
+    "A board and its front end": {
+        "info": ("cli_device", "Versions, limits, counters, exposures and stored models."),
+        "status": ("cli_health", "Is the board well: faults by name, with what to do."),
+        "settings": ("cli_sense", "Frame rate, averaging, power, wiring, lights."),
+        "exposure": ("cli_sense", "The six exposure times: automatic, held, set, limited."),
+        "linearity": ("cli_health", "Self-calibration of the sensors' linearity."),
+        "probe": ("cli_health", "Who sees whom: names swapped, dead and covered LEDs."),
+    },
+    "Calibration": {
+        "calibrate": ("cli_gaze", "Targets, recording, fit, upload and validation in one go."),
+        "record": ("cli_gaze", "Record raw features while targets are shown."),
+        "fit": ("cli_gaze", "Make a model from a recording (no device needed)."),
+        "predict": ("cli_predict", "A model's answers from a target's own binary, with its cycles."),
+        "upload": ("cli_device", "Put a model into the device, safe against power cuts."),
+        "validate": ("cli_gaze", "Measure the device's gaze on held-out targets."),
+        "recentre": ("cli_recentre", "Put a shifted headset right with one look at the centre, or a few."),
+    },
+    "Gaze": {
+        "stream": ("cli_stream", "The gaze computed on the device, live."),
+        "replay": ("cli_stream", "The device's arithmetic on the host, over a recording, to the bit."),
+    },
+    "Simulated optics": {
+        "map": ("cli_map", "What each sensor receives over gaze, on a simulated person."),
+        "view": ("cli_view", "What one sensor sees of a simulated eye, as a picture."),
+        "study": ("cli_study", "Maps of many placements on many people, resumable."),
+    },
 }
+COMMANDS = {name: about for group in GROUPS.values() for name, about in group.items()}
 
 
 class Commands(click.Group):
@@ -66,8 +77,9 @@ class Commands(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx, formatter):
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+        for title, group in GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name, text) for name, (_, text) in group.items()])
 
 
 @click.command(

@@ -64,10 +64,9 @@ def test_every_size_fits_a_slot_of_the_nano(bench, ladder):
     assert sorted(set(sizes)) == list(sizes) and bench.pieces.DEFAULT_N in sizes
     for n in sizes:
         assert choose.most_vectors(None, n) == n
-        grid = NODE_BYTES * (choose.cells(n) + 1) ** 2
-        assert HEAD_BYTES + grid + RECORD_BYTES * n <= choose.NANO_SLOT_BYTES
-    with pytest.raises(ModelError):
-        choose.most_vectors(None, bench.run.LADDER[-1] + 1)
+        bytes_of = HEAD_BYTES + NODE_BYTES * (choose.cells(n) + 1) ** 2 + RECORD_BYTES * n
+        assert bytes_of <= choose.NANO_SLOT_BYTES
+    pytest.raises(ModelError, choose.most_vectors, None, bench.run.LADDER[-1] + 1)
 
 
 def test_the_sizes_that_bars_are_judged_at_are_the_most_that_their_cycles_pay_for(bench):
