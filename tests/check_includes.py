@@ -23,7 +23,7 @@ CORE = {
     "sg_expose": set(), "sg_health": set(),
     "sg_link": {"sg_err", "sg_wire"},
     "sg_gp": {"sg_err", "sg_q", "sg_rom", "sg_model", "sg_gp_loop"},
-    "sg_gp_loop": {"sg_q", "sg_rom", "sg_gp"}, "sg_gp_table": {"sg_gp_loop", "sg_rom"}, "sg_gp_avr": set(),
+    "sg_gp_loop": {"sg_q", "sg_rom", "sg_gp", "sg_gp_avr"}, "sg_gp_table": {"sg_gp_loop", "sg_rom"}, "sg_gp_avr": set(),
     "sg_mlp": {"sg_err", "sg_rom", "sg_model", "sg_mlp_loop"},
     "sg_mlp_loop": {"sg_rom"}, "sg_mlp_table": {"sg_mlp_loop", "sg_rom"}, "sg_mlp_avr": set(),
     "sg_track": {"sg_err", "sg_q", "sg_wire", "sg_model", "sg_gp", "sg_rom", "sg_light",
@@ -33,8 +33,8 @@ ARCHITECTURE = re.compile(r"__AVR|__arm__|__ARM|__x86_64|__i386|_M_X64|__riscv|_
                           r"__APPLE__")
 ARCHITECTURE_FILES = {"sg_rom.h", "sg_gp_avr.S", "sg_mlp_avr.S", "sg_light_avr.S"}
 # Besides include guards.
-CONDITIONS = {"sg_gp_loop.c": {"SG_GP_ASSEMBLY"}, "sg_mlp_loop.c": {"SG_MLP_ASSEMBLY"},
-              "sg_light_loop.c": {"SG_LIGHT_ASSEMBLY"}}
+CONDITIONS = {"sg_gp_loop.c": {"SG_GP_ASSEMBLY"}, "sg_gp_loop.h": {"SG_GP_ASSEMBLY"},
+              "sg_mlp_loop.c": {"SG_MLP_ASSEMBLY"}, "sg_light_loop.c": {"SG_LIGHT_ASSEMBLY"}}
 FORBIDDEN = {
     r"\b(float|double|long double)\b": "floating point",
     r"\b\d+\.\d*[fF]?\b|\b\d+[eE][-+]?\d+\b": "a floating-point constant",

@@ -52,7 +52,7 @@ struct sg_gp_point {
 //   the fit on the device's own arithmetic absorbs). tests/unit/test_core_gp.py asserts the bound and prints it
 //   beside the worst error seen.
 // Cost       O(n d), the same for every input but for 8 cycles (flags). tests/budget.csv; on AVR with the assembly
-//             about 2890 + 154 n cycles with sg_track around it.
+//             about 2730 + 154 n cycles with sg_track around it.
 // Returns    SG_OK, or SG_E_RANGE if an angle saturated (deg_q7 then holds the saturated value).
 int sg_gp_predict(const struct sg_model_view *view, const uint16_t feature[6], struct sg_gp_point *point);
 // cdef end

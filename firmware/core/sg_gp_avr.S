@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 ; sg_gp_loop.c for AVR with a multiplier, bit-identical to it. Formats in sg_gp_loop.h.
 ;
-; Nothing here takes a time that depends on data. SG_GP_FLASH_ONLY leaves out what reads models from ordinary memory,
-; for a build that never has one there.
+; Nothing here takes a time that depends on data. No register is saved but r28 and r29 (sg_gp_avr.h).
+; SG_GP_FLASH_ONLY leaves out what reads models from ordinary memory, for a build that never has one there.
 
 #if defined(__AVR__) && !defined(SG_GP_PORTABLE)
 
@@ -160,22 +160,6 @@
     .global sg_gp_loop
     .type sg_gp_loop, @function
 sg_gp_loop:
-    push r2
-    push r3
-    push r4
-    push r5
-    push r6
-    push r7
-    push r8
-    push r9
-    push r10
-    push r11
-    push r12
-    push r13
-    push r14
-    push r15
-    push r16
-    push r17
     push r28
     push r29
     push r24                    ; sum
@@ -219,22 +203,6 @@ sg_gp_loop:
     clr r1
     pop r29
     pop r28
-    pop r17
-    pop r16
-    pop r15
-    pop r14
-    pop r13
-    pop r12
-    pop r11
-    pop r10
-    pop r9
-    pop r8
-    pop r7
-    pop r6
-    pop r5
-    pop r4
-    pop r3
-    pop r2
     ret
     .size sg_gp_loop, . - sg_gp_loop
 
@@ -266,6 +234,8 @@ sg_gp_loop:
 #define p2 r24
 #define p3 r25
 #define channels_left r11
+#define whole r2                /* where the next s >> 4 goes: r3:r2 */
+#define features r4             /* X meanwhile */
 
 .macro scale load
 1:
@@ -301,7 +271,11 @@ sg_gp_loop:
     or out, mask
     or p1, mask
     or p2, mask
-    push p2                     ; s >> 4, stored when all are known
+    movw features, r26          ; s >> 4
+    movw r26, whole
+    st X+, p2
+    movw whole, r26
+    movw r26, features
     swap p1                     ; p2:p1 >> 4
     swap p2
     andi p1, 0x0F
@@ -332,19 +306,14 @@ sg_gp_loop:
     .global sg_gp_scale
     .type sg_gp_scale, @function
 sg_gp_scale:
-    push channels_left
-    push square0_
-    push square1_
-    push square2_
-    push square3_
-    push out
-    push zero
     push r28
     push r29
     bst r18, 0                  ; T: SG_ROM_FLASH
     movw r26, r22
     movw r28, r24
     adiw r28, SUM_S
+    adiw r24, SUM_S8
+    movw whole, r24
     movw r30, r20
     clr zero
     clr out
@@ -371,19 +340,7 @@ sg_gp_scale:
     rol square3_
     dec mask
     brne 4b
-    pop mask                    ; Y is behind s, where s >> 4 begins
-    std Y+5, mask
-    pop mask
-    std Y+4, mask
-    pop mask
-    std Y+3, mask
-    pop mask
-    std Y+2, mask
-    pop mask
-    std Y+1, mask
-    pop mask
-    st Y, mask
-    sbiw r28, 24 - SUM_S2
+    sbiw r28, SUM_S8 - SUM_S2   ; Y is behind s
     st Y, square1_
     std Y+1, square2_
     std Y+2, square3_
@@ -393,13 +350,6 @@ sg_gp_scale:
     clr r1
     pop r29
     pop r28
-    pop zero
-    pop out
-    pop square3_
-    pop square2_
-    pop square1_
-    pop square0_
-    pop channels_left
     ret
     .size sg_gp_scale, . - sg_gp_scale
 #undef zero
@@ -478,7 +428,6 @@ sg_gp_scale:
     .global sg_gp_trend
     .type sg_gp_trend, @function
 sg_gp_trend:
-    push zero
     push r28
     push r29
     clr zero
@@ -487,7 +436,6 @@ sg_gp_trend:
     by_space r20, outputs
     pop r29
     pop r28
-    pop zero
     clr r1
     ret
     .size sg_gp_trend, . - sg_gp_trend
@@ -629,16 +577,6 @@ sg_gp_round:
     .global sg_gp_find
     .type sg_gp_find, @function
 sg_gp_find:
-    push r4
-    push r5
-    push r6
-    push r7
-    push r8
-    push r9
-    push r10
-    push r11
-    push r12
-    push r13
     push r28
     push r29
     movw r26, r24
@@ -687,16 +625,6 @@ sg_gp_find:
     clr r1
     pop r29
     pop r28
-    pop r13
-    pop r12
-    pop r11
-    pop r10
-    pop r9
-    pop r8
-    pop r7
-    pop r6
-    pop r5
-    pop r4
     ret
     .size sg_gp_find, . - sg_gp_find
 
@@ -836,19 +764,6 @@ sg_gp_find:
     .global sg_gp_judge
     .type sg_gp_judge, @function
 sg_gp_judge:
-    push r2
-    push r3
-    push r4
-    push r5
-    push r6
-    push r7
-    push r8
-    push r9
-    push r10
-    push r11
-    push r12
-    push r13
-    push r14
     push r28
     push r29
     movw r30, r22
@@ -878,19 +793,6 @@ sg_gp_judge:
     clr r1
     pop r29
     pop r28
-    pop r14
-    pop r13
-    pop r12
-    pop r11
-    pop r10
-    pop r9
-    pop r8
-    pop r7
-    pop r6
-    pop r5
-    pop r4
-    pop r3
-    pop r2
     ret
     .size sg_gp_judge, . - sg_gp_judge
 

@@ -29,6 +29,11 @@ enum sg_rom_space { SG_ROM_MEMORY = 0, SG_ROM_FLASH = 1 };
 #include <avr/pgmspace.h>
 #define SG_ROM PROGMEM
 
+// What a part of the core in assembly may leave changed: all but r28 and r29, and the registers that bring its
+// arguments, which have to be operands. It is called where next to nothing is kept in registers.
+#define SG_LOST "r0", "r2", "r3", "r4", "r5", "r6", "r7", "r8", "r9", "r10", "r11", "r12", "r13", "r14", "r15", \
+                "r26", "r27", "r30", "r31", "cc", "memory"
+
 // Does it lie in flash? A build that has no model anywhere else need not ask.
 static inline uint8_t sg_rom_flash(uint8_t space)
 {

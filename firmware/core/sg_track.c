@@ -38,19 +38,21 @@ int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], 
 {
     uint8_t flags = raw_flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_EXPOSURE | SG_FLAG_FAULT
                                  | SG_FLAG_RECOVERING);
-    int16_t deg_q7[2] = { 0, 0 };
     uint8_t sigma_log2_q4 = SG_GP_SIGMA_UNKNOWN;
     int result = SG_OK;
 
+    out->t_us = 0;
+    out->infer_us = 0;
+    out->azimuth_deg_q7 = out->elevation_deg_q7 = 0;
     if (view == NULL) {
         flags |= SG_FLAG_NO_MODEL;
     } else {
         struct sg_gp_point point;
         result = sg_gp_predict(view, feature, &point);
-        deg_q7[0] = point.deg_q7[0];
-        deg_q7[1] = point.deg_q7[1];
-        if (recentre != NULL
-            && !(correct(recentre, 0, point.deg_q7, &deg_q7[0]) & correct(recentre, 1, point.deg_q7, &deg_q7[1])))
+        out->azimuth_deg_q7 = point.deg_q7[0];
+        out->elevation_deg_q7 = point.deg_q7[1];
+        if (recentre != NULL && !(correct(recentre, 0, point.deg_q7, &out->azimuth_deg_q7)
+                                  & correct(recentre, 1, point.deg_q7, &out->elevation_deg_q7)))
             result = SG_E_RANGE;
         flags |= result == SG_OK ? point.flags : (uint8_t)SG_FLAG_OUT_OF_RANGE;
         sigma_log2_q4 = result == SG_OK ? point.sigma_log2_q4 : (uint8_t)SG_GP_SIGMA_HUGE;
@@ -58,10 +60,6 @@ int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], 
                        | SG_FLAG_RECOVERING)))
             flags |= SG_FLAG_VALID;
     }
-    out->t_us = 0;
-    out->azimuth_deg_q7 = deg_q7[0];
-    out->elevation_deg_q7 = deg_q7[1];
-    out->infer_us = 0;
     out->flags = flags;
     out->sigma_log2_q4 = sigma_log2_q4;
     return result;
