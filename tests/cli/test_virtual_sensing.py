@@ -51,6 +51,28 @@ def test_a_rate_that_the_board_cannot_reach_is_refused_by_its_limit(command, com
     assert command_json("settings", nano.port)[1]["rate_hz"] == pytest.approx(limit, rel=0.01)
 
 
+def test_only_low_power_lights_less_at_a_lower_rate(nano):
+    """As power.py says: in normal power a frame of 250 Hz is the mean of four cycles."""
+    def lit(**wanted):
+        device.settings(**wanted)
+        device.link.sleep(0.3)
+        nano.control.counters_clear()
+        began = nano.control.time().cycle
+        device.link.sleep(0.5)
+        return nano.control.counters()["lit_cycles_0"] / (nano.control.time().cycle - began)
+
+    with Device(nano.port) as device:
+        device.exposure(us=[100.0] * 6)
+        try:
+            fastest, slow = lit(rate_hz=0), lit(rate_hz=250)
+            low = lit(rate_hz=250, power="low")
+        finally:
+            device.settings(rate_hz=0, power="normal")
+            device.exposure(auto=True)
+    assert fastest > 0.2 and slow == pytest.approx(fastest, rel=0.02)
+    assert low == pytest.approx(fastest / 4, rel=0.05)
+
+
 def test_exposures_set_here_are_there_after_a_restart(command_json, nano):
     code, data, _ = command_json("exposure", nano.port, "--set", "60,50,40,60,50,40")
     assert code == 0 and not data["automatic"]
