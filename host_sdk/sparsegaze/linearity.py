@@ -152,7 +152,8 @@ def check_steady(holds):
     """Raise CalibrationError when our light was too weak, or the light around was not steady."""
     long = [hold for hold in holds if hold.full]
     if len(long) < 4:
-        raise CalibrationError("too few frames came", "check the cable; `sparsegaze status` names what is wrong")
+        remedy = "check the cable; `sparsegaze status` names what is wrong"
+        raise CalibrationError("too few frames came", remedy)
     rate = np.array([hold.unlit / hold.exposure_us for hold in long])
     own = np.maximum(np.median([(hold.lit - hold.unlit) / hold.exposure_us for hold in long], axis=0), 0.1)
     low, high = np.quantile(rate, [0.02, 0.98], axis=0)

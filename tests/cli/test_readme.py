@@ -32,7 +32,8 @@ def test_every_command_and_option_of_the_readme_exists(readme):
             assert option in told.output, words
 
 
-DOCUMENTS = ["DESIGN.md", "PROTOCOL.md", "CHANGELOG.md", "headsets/led2gaze.toml", "headsets/nextgaze_nano.toml"]
+HEADSETS = ["headsets/led2gaze.toml", "headsets/nextgaze_nano.toml"]
+DOCUMENTS = ["DESIGN.md", "PROTOCOL.md", "CHANGELOG.md", *HEADSETS]
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)
