@@ -116,6 +116,7 @@ void app_sense_start(const struct hal_timing *begin);       // and the port
 void app_sense_timing(const struct hal_timing *wanted);     // from soon on
 const struct hal_timing *app_timing(void);                  // in force
 void app_sense_cycle(const struct hal_cycle *cycle);        // exposure and health of one channel, or two
+void app_sense_step(void);                                  // on with a change of exposures
 uint8_t app_alarm(void);                                    // bits of enum sg_alarm
 uint8_t app_fault(void);                                    // 1: the gaze is not to be trusted
 void app_expose_by(uint8_t op, const uint16_t exposure_us_q4[HAL_CHANNELS]);    // enum sg_exposure_op

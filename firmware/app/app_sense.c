@@ -9,6 +9,8 @@
 enum {
     EMITTERS_PHOTODIODES = 3,
     UNLIKE_LOOKS = 4,
+    EXPOSE_US = 140,            // asking for exposures
+    EXPOSE_CYCLES = 3,          // and if there is no time for it within so many cycles, it is done anyway
     HEALTH_TURNS = 8,           // cycles from one look at the health of a channel to the next channel's; 2^n
     // Cycles of a probe, counted down: until the emitter is alone, its readings, until all is as before.
     PROBE_BEFORE = 4,
@@ -16,6 +18,7 @@ enum {
     PROBE_AFTER = 4,
 };
 
+static uint8_t wished;                  // cycles since exposures were chosen that are not asked for yet; 0: none
 static uint8_t unlike;                  // looks in a row at exposures that are not those asked for
 
 // The channel sampled right before each, per wiring (firmware/core/sg_light.h); 255: none.
@@ -144,10 +147,28 @@ SELDOM void app_expose_by(uint8_t op, const uint16_t exposure_us_q4[HAL_CHANNELS
     app_live_exposed(op == SG_EXPOSURE_SET);
 }
 
+// By a quarter or more: that waits for nothing.
+SELDOM static uint8_t far_from(const uint16_t cycles[HAL_CHANNELS])
+{
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+        const uint16_t wish = app.expose.led[i].exposure_cycles;
+        if ((wish < cycles[i] ? cycles[i] - wish : wish - cycles[i]) > cycles[i] >> 2)
+            return 1;
+    }
+    return 0;
+}
+
 SELDOM static void exposures_moved(void)
 {
+    wished = 0;
     expose();
     app_count(&app.status.exposure_changes);
+}
+
+void app_sense_step(void)
+{
+    if (wished && app_time_for(EXPOSE_US))
+        exposures_moved();
 }
 
 static uint8_t first(uint8_t i)
@@ -198,8 +219,13 @@ void app_sense_cycle(const struct hal_cycle *cycle)
     // One or the other: what a cycle takes at most counts.
     if (health)
         look_at(reading);
-    else if (app.exposure_auto
-             && sg_expose_cycle(&app.expose, reading->lit_code, reading->unlit_code, reading->exposure_cycles))
+    else if (app.exposure_auto && sg_expose_cycle(&app.expose, reading->lit_code, reading->unlit_code, reading->exposure_cycles)) {
+        if (far_from(reading->exposure_cycles))
+            wished = EXPOSE_CYCLES;
+        else if (!wished)
+            wished = 1;
+    }
+    if (wished && wished++ >= EXPOSE_CYCLES)
         exposures_moved();
 }
 

@@ -292,6 +292,7 @@ int main(void)
     while (hal_poll()) {
         if (app.infer_fits || (asked.waiting && app_time_for(0)))
             long_work();
+        app_sense_step();
         app_models_step();
         app_live_step();
     }

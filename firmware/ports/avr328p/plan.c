@@ -9,6 +9,7 @@
 #include "port_sense.h"
 
 #include <avr/pgmspace.h>
+#include <string.h>
 
 #pragma GCC optimize("Os")          // runs when an exposure changes
 
@@ -19,52 +20,59 @@ const uint8_t plan_place[2][HAL_CHANNELS] PROGMEM = {
 
 struct plan sense_plan[2];
 
-// The list being written.
-static uint8_t *to;
-static uint8_t *word;                   // of the event before
-static int16_t match;                   // its compare match, from the trigger of the half's first slot
-
 uint8_t plan_channel(uint8_t wiring, uint8_t place)
 {
     return pgm_read_byte(&plan_place[wiring != SG_WIRING_LEDS][place]);
 }
 
+static inline uint16_t clipped(uint16_t cycles, uint8_t least, uint16_t most)
+{
+    return cycles > most ? most : cycles < least ? least : cycles;
+}
+
 void plan_clip(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t wiring, uint16_t slot_cycles)
 {
-    uint16_t same = 0;                  // exposure with the release of the pair's first
-    for (uint8_t place = 0; place < HAL_CHANNELS; place++) {
-        const uint8_t second = place & 1;
-        uint16_t *cycles = &exposure_cycles[plan_channel(wiring, place)];
-        const uint16_t most = (second ? 3 : 2) * slot_cycles - EXPOSURE_LESS_CYCLES;
-        const uint8_t least = second ? EXPOSURE_SECOND_MIN_CYCLES : EXPOSURE_MIN_CYCLES;
-        if (*cycles < least)
-            *cycles = least;
-        if (*cycles > most)
-            *cycles = most;
-        const int16_t apart = *cycles - same;
-        if (second && apart > -EXPOSURES_APART_CYCLES && apart < EXPOSURES_APART_CYCLES) {
-            *cycles = same;
+    const uint16_t first_most = 2 * slot_cycles - EXPOSURE_LESS_CYCLES, most = first_most + slot_cycles;
+    for (uint8_t place = 0; place < HAL_CHANNELS; place += 2) {
+        uint16_t *const a = &exposure_cycles[plan_channel(wiring, place)];
+        uint16_t *const b = &exposure_cycles[plan_channel(wiring, place + 1)];
+        *a = clipped(*a, EXPOSURE_MIN_CYCLES, first_most);
+        uint16_t cycles = clipped(*b, EXPOSURE_SECOND_MIN_CYCLES, most);
+        const uint16_t same = *a + slot_cycles;     // with the release of the pair's first
+        const int16_t apart = cycles - same;
+        if (apart > -EXPOSURES_APART_CYCLES && apart < EXPOSURES_APART_CYCLES) {
+            cycles = same;
             if (apart <= -EXPOSURES_APART_CYCLES / 2)
-                *cycles -= EXPOSURES_APART_CYCLES;
+                cycles -= EXPOSURES_APART_CYCLES;
             if (apart >= EXPOSURES_APART_CYCLES / 2)
-                *cycles += EXPOSURES_APART_CYCLES;
-            if (*cycles > most)
-                *cycles = same;
+                cycles += EXPOSURES_APART_CYCLES;
+            if (cycles > most)
+                cycles = same;
         }
-        same = *cycles + slot_cycles;
+        *b = cycles;
     }
 }
 
-static void event(uint8_t kind, int16_t at)
+// In registers while a list is written.
+struct writer {
+    uint8_t *to;
+    uint8_t *word;                      // of the event before
+    int16_t match;                      // its compare match, from the trigger of the half's first slot
+};
+
+// The list being written.
+static struct writer writer;
+
+static inline __attribute__((always_inline)) void event(struct writer *w, uint8_t kind, int16_t at)
 {
-    const uint16_t delta = at - match;
-    word[0] = (uint8_t)delta;
-    word[1] |= (uint8_t)(delta >> 8);
-    match = at;
-    word = to;
-    to[0] = 0;
-    to[1] = kind;
-    to += 2;
+    const uint16_t delta = at - w->match;
+    w->word[0] = (uint8_t)delta;
+    w->word[1] |= (uint8_t)(delta >> 8);
+    w->match = at;
+    w->word = w->to;
+    w->to[0] = 0;
+    w->to[1] = kind;
+    w->to += 2;
 }
 
 static __attribute__((noinline)) uint8_t bit(uint8_t i)
@@ -72,15 +80,16 @@ static __attribute__((noinline)) uint8_t bit(uint8_t i)
     return 1 << i;
 }
 
-static void put(uint8_t byte)
+static inline __attribute__((always_inline)) void put(struct writer *w, uint8_t byte)
 {
-    *to++ = byte;
+    *w->to++ = byte;
 }
 
 static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lights, uint8_t phase)
 {
     const int16_t slot = (int16_t)plan->slot_cycles;
-    uint8_t *const begin = to;
+    struct writer w = writer;
+    uint8_t *const begin = w.to;
     const uint8_t a = plan_channel(timing->wiring, 2 * phase);
     const uint8_t b = plan_channel(timing->wiring, 2 * phase + 1);
     uint8_t bits = bit(a), more = bit(b);
@@ -145,14 +154,14 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
             } else if (k != 3 && at >= service + SPACING_CYCLES && release > trigger + SERVICE_LATEST) {
                 break;
             }
-            event((lead ? EVENT_SET_RELEASE : EVENT_RELEASE) | EVENT_ALONE, at);
+            event(&w, (lead ? EVENT_SET_RELEASE : EVENT_RELEASE) | EVENT_ALONE, at);
             if (lead) {
-                put(portc);
-                put(portd);
-                put((uint8_t)(release - at - LEAD_LESS_CYCLES));
+                put(&w, portc);
+                put(&w, portd);
+                put(&w, (uint8_t)(release - at - LEAD_LESS_CYCLES));
                 set = 0;
             }
-            put(PORTC_ALL & (uint8_t)~bits);
+            put(&w, PORTC_ALL & (uint8_t)~bits);
             // With the release, if the last sample has been taken long enough.
             released = release >= service + WITH_RELEASE_CYCLES;
             if (service < release + AFTER_RELEASE_CYCLES)
@@ -171,26 +180,50 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
         if (k == 2 && phase != 0)
             kind = EVENT_SERVICE;
         if (released)
-            word[1] ^= EVENT_ALONE ^ kind;
+            w.word[1] ^= EVENT_ALONE ^ kind;
         else
-            event(kind, service);
+            event(&w, kind, service);
         if (k == 0 && phase == 0)
-            plan->first_mux = to;
-        put(admux);
+            plan->first_mux = w.to;
+        put(&w, admux);
         admux = k == 0 ? admux_a : admux_b;
         trigger += slot;
         service = trigger + SERVICE_AT;
     }
-    event(phase == 2 ? EVENT_LAST : EVENT_AGAIN, 2 * slot + HOLD_AT);
-    put((uint8_t)(to - begin));
-    match -= 3 * slot;
+    event(&w, phase == 2 ? EVENT_LAST : EVENT_AGAIN, 2 * slot + HOLD_AT);
+    put(&w, (uint8_t)(w.to - begin));
+    plan->end[phase] = (uint8_t)(w.to - plan->event);
+    w.match -= 3 * slot;
+    writer = w;
+}
+
+static void begin_list(struct plan *plan, uint8_t phase)
+{
+    if (phase == 0) {
+        writer.to = plan->event;
+        writer.word = plan->event;
+    }
 }
 
 void plan_write(struct plan *plan, const struct hal_timing *timing, uint8_t lights, uint8_t phase)
 {
-    if (phase == 0) {
-        to = plan->event;
-        word = to;
-    }
+    begin_list(plan, phase);
     pair(plan, timing, lights, phase);
+}
+
+void plan_copy(struct plan *plan, const struct plan *from, uint8_t phase)
+{
+    begin_list(plan, phase);
+    const uint8_t begin = phase ? from->end[phase - 1] : 0;
+    const uint8_t n = from->end[phase] - begin;
+    memcpy(writer.to, from->event + begin, n);
+    writer.to += n;
+    plan->end[phase] = (uint8_t)(writer.to - plan->event);
+    if (phase == 0) {
+        plan->first_mux = plan->event + (from->first_mux - from->event);
+        *plan->first_mux = ADMUX_GROUND;            // the other may ask for the supply just now
+    }
+    // Where every list begins and ends.
+    writer.word = writer.to - 3;
+    writer.match = HOLD_AT - (int16_t)plan->slot_cycles;
 }

@@ -70,6 +70,7 @@ struct plan {
     uint16_t exposure_cycles[HAL_CHANNELS];
     uint16_t slot_cycles;
     uint8_t *first_mux;             // ADMUX of slot 0
+    uint8_t end[3];                 // of each list, in `event`
 };
 
 // One cycle as the interrupt leaves it. Codes in the order of slots: of the first pair GND, lit a, b, GND,
@@ -121,7 +122,9 @@ extern const uint8_t plan_place[2][HAL_CHANNELS];        // in flash
 uint8_t plan_channel(uint8_t wiring, uint8_t place);
 // Limits, and two releases not too near each other.
 void plan_clip(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t wiring, uint16_t slot_cycles);
-// One list, from plan->exposure_cycles, which are clipped, and plan->slot_cycles; in order 0, 1, 2.
+// One list, from plan->exposure_cycles, which are clipped, and plan->slot_cycles; in order 0, 1, 2. Or the same
+// as another plan's.
 void plan_write(struct plan *plan, const struct hal_timing *timing, uint8_t lights, uint8_t phase);
+void plan_copy(struct plan *plan, const struct plan *from, uint8_t phase);
 
 #endif

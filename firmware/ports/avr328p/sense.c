@@ -12,6 +12,7 @@
 enum {
     NONE = 255,
     WAIT_AT = 120,                  // compare match of EVENT_WAIT after that of the service before it
+    PLAN_PATIENCE = 3,              // turns
     PAUSE_LEAST_SLOTS = 3,
     RESTART_CYCLES = 1500,          // before a frame that begins with another timing
     PAUSE_MOST = 16000000,          // a frame a second, at least
@@ -57,6 +58,8 @@ static uint16_t slot;                       // of `timing`
 static __uint24 pause_new;
 static uint8_t timing_new, plan_new;        // asked for and not in a plan yet
 static uint8_t plan_urgent;             // an exposure halves or doubles: the light is another, nothing waits for turns
+static uint8_t plan_whole = 1;          // no list of it is that of the plan in use
+static uint8_t plan_waited;             // turns, for time to write a list
 static uint8_t written;                     // lists of the next plan
 static uint8_t locked_out;
 uint8_t sense_took;                         // cycles taken, low byte
@@ -312,11 +315,13 @@ SELDOM void hal_set_timing(struct hal_timing *t)
     plan_clip(exposure, t->wiring, n);
     timing_new = 1;
     plan_new = 1;
+    plan_whole = 1;
     written = 0;
 }
 
-// One list of the plan that is not in use, and when all are written it is the next.
-SELDOM static void write_plan(void)
+// One list of the plan that is not in use, and when all are written it is the next. Returns 1 if that took little
+// time.
+SELDOM static uint8_t write_plan(void)
 {
     const uint8_t index = !plan_next;
     struct plan *plan = &sense_plan[index];
@@ -325,11 +330,18 @@ SELDOM static void write_plan(void)
         memcpy(plan->exposure_cycles, exposure, sizeof exposure);
         plan->slot_cycles = slot;
     }
-    plan_write(plan, &timing, timing.lights && !locked_out, written);
+    const struct plan *now_used = &sense_plan[plan_next];
+    const uint8_t a = plan_channel(timing.wiring, 2 * written), b = plan_channel(timing.wiring, 2 * written + 1);
+    const uint8_t copied = !plan_whole && plan->exposure_cycles[a] == now_used->exposure_cycles[a]
+                           && plan->exposure_cycles[b] == now_used->exposure_cycles[b];
+    if (copied)
+        plan_copy(plan, now_used, written);
+    else
+        plan_write(plan, &timing, timing.lights && !locked_out, written);
     if (++written != 3)
-        return;
+        return copied;
     written = 0;
-    plan_urgent = 0;
+    plan_urgent = plan_whole = 0;
     if (shown_plan == index)
         shown_plan = NONE;
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
@@ -343,6 +355,19 @@ SELDOM static void write_plan(void)
             sense_list_next = plan->event;
         }
     }
+    return 0;
+}
+
+// A list takes about two slots, and may make the next frame wait a little, but not be late. After some turns it
+// no longer waits for that.
+static uint8_t time_for_list(void)
+{
+    const uint16_t since = ticks_now() - sense_base;
+    if (plan_urgent || ++plan_waited >= PLAN_PATIENCE || (sense_done == sense_took && since < (SLOTS - 1) * sense_slot)) {
+        plan_waited = 0;
+        return 1;
+    }
+    return 0;
 }
 
 void sense_poll(void)
@@ -350,13 +375,14 @@ void sense_poll(void)
     if (locked_out && sense_wraps >= LOCKOUT_WRAPS) {
         locked_out = 0;
         plan_new = 1;
+        plan_whole = 1;
         written = 0;
     }
     // The other plan is free when neither the running cycle nor the newest complete one follows it.
-    if ((plan_new || written) && sense_current == plan_next && filling()->other->plan == plan_next)
-        do {
-            write_plan();
-        } while (plan_urgent && written);
+    if ((plan_new || written) && sense_current == plan_next && filling()->other->plan == plan_next
+        && time_for_list())
+        while ((write_plan() || plan_urgent) && written) {
+        }
     try_supply();
 }
 
