@@ -81,6 +81,9 @@ def stream(port, seconds, csv, counts, baud, as_json):
     )
     if tally.frames and tally.without_model == tally.frames:
         text += f"\nthe device has no model: run `sparsegaze calibrate {port}`"
+    elif tally.frames and not tally.valid and not tally.faulty:
+        text += f"\nno gaze was valid: see `sparsegaze doctor {port}`; if all is well there (another person, "
+        text += f"a headset that moved) run `sparsegaze calibrate {port}`"
     if tally.faulty:
         text += f"\n{tally.faulty} frames with a fault: `sparsegaze status {port}` names it"
     if csv == "-":

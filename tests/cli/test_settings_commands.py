@@ -260,3 +260,11 @@ def test_a_stream_of_no_finite_length_is_refused_before_the_port_is_opened(comma
     monkeypatch.setattr("sparsegaze.device.Device", lambda *_: pytest.fail("the port was opened"))
     code, _, err = command("stream", "PORT", "--seconds", seconds)
     assert code == 2 and "--seconds" in err and len(err.splitlines()) == 1
+
+
+def test_a_stream_without_one_valid_gaze_says_what_to_do(command, fake):
+    fake(linear_model(), raw_flags=lambda t_us: lib.SG_FLAG_STARVED)
+    out = command("stream", "PORT", "--seconds", "1")[1]
+    assert "0.0 % valid" in out and "no gaze was valid" in out and "sparsegaze calibrate PORT" in out
+    fake(linear_model())
+    assert "no gaze was valid" not in command("stream", "PORT", "--seconds", "1")[1]
