@@ -4,8 +4,10 @@
 enum {
     CHANNELS = 6,
     OCTAVE = 4096,
-    NEAR = OCTAVE >> 1,
-    RANGE_STEPS = 4096,         // of the calibrated range
+    // Above the middle of what was calibrated: shut lids of six simulated persons reach 1.48 octaves, wherever the
+    // eye looks behind them and whatever its pupil, a finger before the brightest LED makes 1.5 to 1.9.
+    ABOVE = OCTAVE + OCTAVE / 2,
+    MIDDLE_STEPS = 2048,        // of the model's range
     // A node without an LED has the pin's 6 pF and takes 14 of 20 parts of what the sample capacitor held:
     // 7/10 of the code before. It follows that code even as it moves, which no LED does.
     MIRROR_NUMERATOR = 7, MIRROR_DENOMINATOR = 10,
@@ -32,7 +34,7 @@ static uint8_t debounced(uint8_t *count, uint8_t suspected, uint8_t known)
     return *count == 0 ? 0 : known;
 }
 
-// Does the channel only repeat the one sampled before it? Asked until that one has moved by an eighth.
+// Does the channel only repeat the one sampled before it? Asked until that one has moved by a sixteenth.
 static uint8_t mirrors(struct sg_health *health, uint8_t i, const struct sg_health_sight *sight)
 {
     if (sight->before_code < MIRROR_LEAST)
@@ -50,7 +52,7 @@ static uint8_t mirrors(struct sg_health *health, uint8_t i, const struct sg_heal
         health->least[i] = before_q2;
     if (before_q2 > health->most[i])
         health->most[i] = before_q2;
-    return (uint8_t)(health->most[i] - health->least[i]) > health->most[i] >> 3;
+    return (uint8_t)(health->most[i] - health->least[i]) > health->most[i] >> 4;
 }
 
 static uint8_t electrical(struct sg_health *health, uint8_t i, const struct sg_health_sight *sight)
@@ -70,10 +72,10 @@ static uint8_t optical(const struct sg_health_sight *sight)
         return 0;
     if ((int32_t)sight->feature + OCTAVE < (int32_t)sight->offset)
         return SG_HEALTH_LOW;
-    if ((int32_t)sight->feature - NEAR < (int32_t)sight->offset)
+    if ((int32_t)sight->feature - ABOVE < (int32_t)sight->offset)
         return 0;
-    const uint32_t above = (uint32_t)(sight->feature - sight->offset - NEAR) * sight->gain_q12;
-    return above >> 12 >= RANGE_STEPS ? SG_HEALTH_HIGH : 0;
+    const uint32_t above = (uint32_t)(sight->feature - sight->offset - ABOVE) * sight->gain_q12;
+    return above >> 12 >= MIDDLE_STEPS ? SG_HEALTH_HIGH : 0;
 }
 
 uint8_t sg_health_look(struct sg_health *health, uint8_t channel, const struct sg_health_sight *sight)

@@ -14,7 +14,7 @@ enum sg_health_fault {
     SG_HEALTH_OPEN = 1,         // no current at all, lit or not, at the longest exposure
     SG_HEALTH_SHORT = 2,        // full at the shortest exposure, lit or not
     SG_HEALTH_LOW = 4,          // an octave or more below the calibrated range
-    SG_HEALTH_HIGH = 8,         // half an octave or more above it
+    SG_HEALTH_HIGH = 8,         // one and a half octaves or more above its middle
 };
 enum sg_health_limits {
     SG_HEALTH_PATIENCE = 6,             // looks at a channel: 0.29 s at 48 ms a look

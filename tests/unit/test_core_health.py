@@ -7,6 +7,7 @@ from light_reference import CAPS, JUNCTION_PF, NOISE_LSB, PIN_PF, SAMPLE_PF, Boa
 from sparsegaze._core import ffi, lib
 
 PATIENCE, OCTAVE = lib.SG_HEALTH_PATIENCE, 4096
+ABOVE = 3 * OCTAVE // 2        # the middle of the range
 OFFSET, GAIN_Q12 = 40000, 2048              # the calibrated range: 40000 .. 48192
 GOOD = {"lit_code": 400, "unlit_code": 3, "before_code": 380, "exposure_cycles": CAPS[0], "most_cycles": CAPS[0],
         "feature": 44000, "offset": OFFSET, "gain_q12": GAIN_Q12}
@@ -34,7 +35,7 @@ FAULTS = {
     "open": (lib.SG_FAULT_OPEN, {"lit_code": 2, "unlit_code": 1}),
     "short": (lib.SG_FAULT_SHORT, {"lit_code": 1023, "unlit_code": 1023, "exposure_cycles": 64}),
     "covered": (lib.SG_FAULT_LOW, {"feature": OFFSET - OCTAVE - 1}),
-    "finger": (lib.SG_FAULT_HIGH, {"feature": OFFSET + 8192 + OCTAVE // 2}),
+    "finger": (lib.SG_FAULT_HIGH, {"feature": OFFSET + 4096 + ABOVE}),
 }
 
 
@@ -59,7 +60,7 @@ def test_what_does_not_last_is_no_fault(name):
 
 @pytest.mark.parametrize("kind,changed", {
     "an octave below, not more": {"feature": OFFSET - OCTAVE},
-    "half an octave above, not more": {"feature": OFFSET + 8191 + OCTAVE // 2 - 1},
+    "1.5 octaves above the middle, not more": {"feature": OFFSET + 4096 + ABOVE - 1},
     "no model": {"feature": 0, "gain_q12": 0, "offset": 0},
     "dark but short exposed": {"lit_code": 1, "unlit_code": 1, "exposure_cycles": 64},
     "dark with leakage": {"lit_code": 6, "unlit_code": 5},
@@ -76,9 +77,9 @@ def test_the_end_of_the_feature_range_overflows_nothing():
         for feature in (0, 1, 4095, 4096, 32768, 65535):
             health = Health()
             found = health.look(PATIENCE, offset=offset, gain_q12=gain, feature=feature)[-1]
-            above = ((feature - offset - OCTAVE // 2) * gain) >> 12
+            above = ((feature - offset - ABOVE) * gain) >> 12
             expected = lib.SG_FAULT_LOW if feature + OCTAVE < offset else \
-                lib.SG_FAULT_HIGH if feature - offset >= OCTAVE // 2 and above >= 4096 else 0
+                lib.SG_FAULT_HIGH if feature - offset >= ABOVE and above >= 2048 else 0
             assert found == expected, (offset, gain, feature)
 
 
