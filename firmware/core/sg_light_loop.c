@@ -100,18 +100,19 @@ static int16_t ambient_q5(const struct sg_light *light, struct sg_light_channel 
     if (!moves) {
         if (size_of(off) < SG_LIGHT_STEP_Q5)
             return mean < SG_LIGHT_CLIPPED_Q5 ? unclipped_q5(mean, light->zero_q5) : (int16_t)mean;
-        settle(channel, unlit_q5);
-        if (size_of(off) >= SG_LIGHT_LEAP_Q5)
-            channel->flags |= SG_LIGHT_STARVED;
+        settle(channel, unlit_q5);      // nobody knows whether the lit exposure saw it
+        channel->flags |= SG_LIGHT_STARVED;
         return (int16_t)unlit_q5;
     }
     const uint16_t before = channel->unlit_q5[0], earlier = channel->unlit_q5[1];
     channel->unlit_q5[1] = before;
     channel->unlit_q5[0] = unlit_q5;
     const int16_t past = (int16_t)(before - unlit_q5), long_past = (int16_t)(earlier - unlit_q5);
-    if (size_of(past) >= SG_LIGHT_LEAP_Q5) {    // no flicker falls or rises by all but a sixteenth in a cycle
+    const uint16_t size = size_of(past);
+    // No flicker falls or rises by all but a sixteenth in a cycle, but near its least.
+    if (size >= SG_LIGHT_LEAP_Q5 && size >= mean >> 1) {
         const uint16_t most = past < 0 ? unlit_q5 : before;
-        if (size_of(past) - SG_LIGHT_LEAP_Q5 >= most - (most >> 4)) {
+        if (size >= most - (most >> 4)) {
             settle(channel, unlit_q5);
             channel->flags |= SG_LIGHT_STARVED;
             return (int16_t)unlit_q5;

@@ -13,7 +13,7 @@
 enum {
     SG_LIGHT_SETTLED = 16,              // the mean of unlit codes follows by 1/16 from then on
     SG_LIGHT_STEP_Q5 = 112,             // 3.5 codes, 4.3 times the noise: what rested has moved
-    SG_LIGHT_LEAP_Q5 = 32 * 32,         // of which nobody knows whether the lit exposure saw it
+    SG_LIGHT_LEAP_Q5 = 32 * 32,         // of what moves, when it is nearly all that there was
     // Mean square of what six channels depart together; noise alone is 256. Interpolate from, average below:
     SG_LIGHT_MOVING_FROM = 1024,
     SG_LIGHT_RESTING_BELOW = 640,
