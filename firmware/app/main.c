@@ -10,8 +10,12 @@ enum {
     REPLY_RESERVE = SG_WIRE_FRAME_MAX,
     // A blink leaves the calibrated range before the lids are where they were: this long after the last frame
     // out of range a gaze may look right and be wrong.
-    RECOVERY_US = 31000,
-    BLINK_US = 3900,                    // out of range for so long
+    RECOVERY_256US = 122,
+    BLINK_256US = 16,                   // out of range for so long, and one
+    // No eye turns by more than a degree in a millisecond. What moves by that and so much more is noise, such as
+    // sunlight beside little of ours makes of a gaze; its neighbours are no better, whatever they say.
+    JUMP_DEG_Q1 = 3,                    // a degree in 1024 us is one in 512 us
+    CALM_256US = 32,
     BYTES_US = 130,                     // a look at the line
     REQUEST_US = 188,                   // a request, and its answer
     // One that makes a frame late is heard after so many cycles, if no frame is late yet: it takes 500 us, and
@@ -39,10 +43,11 @@ static uint8_t refused;                 // a request came and found no time
 static uint8_t waited;                  // cycles that it has waited
 
 static uint16_t previous_exposure[HAL_CHANNELS];
-static uint32_t out_us;                 // when the last frame out of range was sensed
-static uint8_t recovering;
-static uint8_t out_before;              // the frame before was out of range
-static uint16_t since_us;               // and since then
+// A frame is never 65 ms: bytes tell times apart.
+static uint8_t before_256us;            // when the frame before was sensed
+static uint8_t hold_256us;              // no gaze is called valid for so long
+static uint8_t out_256us;               // for so long out of range, and one; at most a little more than BLINK
+static uint8_t before_deg_q1[2];        // the gaze before, modulo 128 deg
 
 void app_count(uint16_t *counter)
 {
@@ -154,6 +159,15 @@ SELDOM static void count_readings(void)
     }
 }
 
+// Is this angle farther from that of the frame before than an eye can turn?
+static uint8_t jumps(int16_t deg_q7, uint8_t axis, uint8_t most_q1)
+{
+    const uint8_t deg_q1 = (uint8_t)((uint16_t)deg_q7 >> 6);
+    const uint8_t off = (uint8_t)(deg_q1 - before_deg_q1[axis] + most_q1);
+    before_deg_q1[axis] = deg_q1;
+    return off > (uint8_t)(most_q1 << 1);
+}
+
 // The frame whose last cycle this is: features -> gaze -> streams, the gaze first, somebody waits for it.
 static void finish_frame(const struct hal_cycle *cycle)
 {
@@ -173,11 +187,13 @@ static void finish_frame(const struct hal_cycle *cycle)
     flags |= exposures_changed(&cycle->reading);
     if (app_fault())
         flags |= SG_FLAG_FAULT;
-    if (recovering) {
-        if (t_us - out_us > RECOVERY_US)
-            recovering = 0;
-        else
-            flags |= SG_FLAG_RECOVERING;
+    const uint8_t since = (uint8_t)((uint8_t)((uint16_t)t_us >> 8) - before_256us);
+    before_256us = (uint8_t)((uint16_t)t_us >> 8);
+    if (hold_256us > since) {
+        hold_256us = (uint8_t)(hold_256us - since);
+        flags |= SG_FLAG_RECOVERING;
+    } else {
+        hold_256us = 0;
     }
 
     HAL_BEGIN(HAL_SECTION_INFER);
@@ -187,15 +203,20 @@ static void finish_frame(const struct hal_cycle *cycle)
     if ((out->gaze.flags & SG_FLAG_OUT_OF_RANGE)
         && !(flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_EXPOSURE))) {
         // Lids stay away for long; noise does not, nor does it reach means of several cycles.
-        if (!out_before)
-            since_us = (uint16_t)t_us;
-        if (app.pause || app_timing()->repeats > 1 || (uint16_t)((uint16_t)t_us - since_us) >= BLINK_US) {
-            out_us = t_us;
-            recovering = 1;
+        out_256us = (uint8_t)(out_256us ? out_256us + since : 1);
+        if (app.pause || app_timing()->repeats > 1 || out_256us >= BLINK_256US) {
+            hold_256us = RECOVERY_256US;
+            out_256us = BLINK_256US;
         }
-        out_before = 1;
     } else {
-        out_before = 0;
+        out_256us = 0;
+    }
+    const uint8_t most = (uint8_t)((since >> 1) + JUMP_DEG_Q1);    // at most 125
+    if (jumps(out->gaze.azimuth_deg_q7, 0, most) | jumps(out->gaze.elevation_deg_q7, 1, most)) {
+        if (hold_256us < CALM_256US)
+            hold_256us = CALM_256US;
+        flags |= SG_FLAG_RECOVERING;
+        out->gaze.flags = (uint8_t)((out->gaze.flags & ~SG_FLAG_VALID) | SG_FLAG_RECOVERING);
     }
 
     HAL_BEGIN(HAL_SECTION_OUTPUT);

@@ -56,8 +56,8 @@ int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], 
             result = SG_E_RANGE;
         flags |= result == SG_OK ? point.flags : (uint8_t)SG_FLAG_OUT_OF_RANGE;
         sigma_log2_q4 = result == SG_OK ? point.sigma_log2_q4 : (uint8_t)SG_GP_SIGMA_HUGE;
-        if (!(flags & (SG_FLAG_OUT_OF_RANGE | SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_FAULT
-                       | SG_FLAG_RECOVERING)))
+        if (!(flags & (SG_FLAG_OUT_OF_RANGE | SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_EXPOSURE
+                       | SG_FLAG_FAULT | SG_FLAG_RECOVERING)))
             flags |= SG_FLAG_VALID;
     }
     out->flags = flags;

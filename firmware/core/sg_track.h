@@ -21,8 +21,9 @@
 //                     G g and the sum exact in 32 bits (|G g| <= 2^23), then saturated
 //   out               whole frame, written last: it may lie over `feature`. t_us and infer_us are 0: the
 //                     caller owns the clock. sigma is that of the model's output, uncorrected
-// SG_FLAG_VALID is set only when there is a model and none of OUT_OF_RANGE, SATURATED, STARVED, FAULT,
-// RECOVERING is set.
+// SG_FLAG_VALID is set only when there is a model and none of OUT_OF_RANGE, SATURATED, STARVED, EXPOSURE,
+// FAULT, RECOVERING is set. (A frame in which an exposure changed holds fewer cycles of it, and its ambient
+// light is known from one code.)
 // Returns SG_OK, or SG_E_RANGE when an angle saturated (the frame is then OUT_OF_RANGE and not VALID).
 int sg_track_infer(const struct sg_model_view *view, const uint16_t feature[6], uint8_t raw_flags,
                    const struct sg_affine *recentre, struct sg_gaze *out);

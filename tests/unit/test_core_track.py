@@ -10,7 +10,8 @@ from sparsegaze._core import ffi, lib
 
 RAW_FLAGS = (lib.SG_FLAG_SATURATED, lib.SG_FLAG_STARVED, lib.SG_FLAG_EXPOSURE, lib.SG_FLAG_FAULT,
              lib.SG_FLAG_RECOVERING)
-BAD_FLAGS = lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_FAULT | lib.SG_FLAG_RECOVERING
+BAD_FLAGS = (lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_EXPOSURE | lib.SG_FLAG_FAULT |
+             lib.SG_FLAG_RECOVERING)
 
 
 def plain(bias_deg_q7=(0, 0)):
