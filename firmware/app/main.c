@@ -6,8 +6,9 @@
 #include <string.h>
 
 enum {
-    // Stream frames leave this much of the send queue to answers.
-    REPLY_RESERVE = SG_WIRE_FRAME_MAX,
+    // Stream frames leave this much of the send queue to answers that were not waited with: all others have their
+    // room before the request is heard.
+    REPLY_RESERVE = 24,
     // A blink leaves the calibrated range before the lids are where they were: this long after the last frame
     // out of range a gaze may look right and be wrong.
     RECOVERY_256US = 122,

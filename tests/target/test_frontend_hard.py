@@ -312,6 +312,8 @@ def test_a_command_storm_at_full_frame_rate_loses_and_delays_nothing(worn):
                 (lib.SG_MSG_PING, wire.body("struct sg_ping", token=7)), (lib.SG_MSG_MODEL_INFO, b""),
                 (lib.SG_MSG_SETTINGS, wire.body("struct sg_settings")), (lib.SG_MSG_HELLO, b"")]
     decoder, seen, lost, sent = wire.Decoder(), [], [], 300
+    decoder.feed(link.read(4096, 0.01))                     # it begins to listen in the middle of a frame
+    began_bad = decoder.bad
     for ticket in range(sent):
         kind, body = requests[ticket % len(requests)]
         link.write(wire.encode(kind, ticket, body))
@@ -327,7 +329,7 @@ def test_a_command_storm_at_full_frame_rate_loses_and_delays_nothing(worn):
     gaps = np.diff(np.array(seen)) % 65536
     print(f"{len(lost)} of {sent} lost {lost[:8]}; {len(seen)} gazes, {int((gaps != 1).sum())} gaps;"
           f" longest pulse {counted['longest_pulse_cycles']} of {PULSE_CYCLES} cycles")
-    assert not lost and len(seen) >= sent and (gaps == 1).all() and decoder.bad == 0
+    assert not lost and len(seen) >= sent and (gaps == 1).all() and decoder.bad == began_bad <= 1
     assert counted["longest_pulse_cycles"] <= PULSE_CYCLES
     nothing_lost(before, after)
     assert after.rx_overrun == before.rx_overrun and after.rx_bad == before.rx_bad

@@ -199,7 +199,9 @@ def test_answers_survive_a_flood_and_dropped_frames_are_counted(board):
                 streamed.append(packet)
     link.sleep(0.05)
     decoder.feed(link.read(4096, 0.01))
-    assert decoder.bad <= 1 and len(answered) > 300         # it began to listen in the middle of a frame
+    # The streams leave a ninth of the line to answers, 80 a second, and give way a little; all are answered.
+    assert decoder.bad <= 1 and len(answered) > 100         # it began to listen in the middle of a frame
+    assert len(request) - len(answered) <= 6
     by_kind = {kind: [p.seq for p in streamed if p.type == kind]
                for kind in (lib.SG_MSG_RAW, lib.SG_MSG_GAZE, lib.SG_MSG_COUNTS)}
     sensed = max(seqs[-1] for seqs in by_kind.values()) - min(seqs[0] for seqs in by_kind.values()) + 1

@@ -177,10 +177,12 @@ uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_
     const uint8_t polled = keep_free && n > LONG_BODY ? POLLED_LONG : POLLED_BYTES;
     const uint8_t waiting = TX_RING - 1 - serial_room();
     if (waiting > polled + SENT_MEANWHILE) {
-        // No more by the interrupt than this packet has: an answer is worked off by the polling, bit by bit.
+        // Not much more by the interrupt than this packet has: the polling works off an answer, bit by bit.
         uint8_t sent = waiting - polled;
         if (sent > n + AROUND_BODY)
             sent = n + AROUND_BODY;
+        if (waiting - sent > POLLED_BYTES)
+            sent = waiting - POLLED_BYTES;
         ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
             const uint8_t tail = tx_tail;
             UCSR0B = POLLED | (1 << UDRIE0);
