@@ -14,11 +14,15 @@
 // What runs when a model is checked and never for a frame: compiled for size.
 #define SELDOM __attribute__((noinline, cold))
 
+// Half a byte.
+SELDOM static uint32_t crc32_on(uint32_t crc)
+{
+    return (crc >> 4) ^ sg_rom_dword(&crc32_table[(uint8_t)crc & 15U]);
+}
+
 static uint32_t crc32_byte(uint32_t crc, uint8_t byte)
 {
-    crc ^= byte;
-    crc = (crc >> 4) ^ sg_rom_dword(&crc32_table[crc & 15U]);
-    return (crc >> 4) ^ sg_rom_dword(&crc32_table[crc & 15U]);
+    return crc32_on(crc32_on(crc ^ byte));
 }
 
 uint32_t sg_model_crc32_at(uint32_t crc, const uint8_t *data, uint16_t n, uint8_t space)
