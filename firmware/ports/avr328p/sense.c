@@ -4,6 +4,7 @@
 #include "port_sense.h"
 
 #include <avr/pgmspace.h>
+#include <stddef.h>
 #include <string.h>
 
 #define SELDOM __attribute__((noinline, cold))
@@ -24,6 +25,7 @@ enum {
     SUPPLY_CODE_LEAST = 130,        // 4.2 V at a bandgap of 1.2 V,
     SUPPLY_CODE_MOST = 235,         // 5.7 V at 1.0 V: beyond, nothing or something else is on the pin
     SUPPLY_MV_PER_CODE_Q8 = 6875,   // 1.1 V / 1024 / 0.04
+    UNLIT_AFTER = offsetof(struct sg_reading, unlit_code) / sizeof(uint16_t),   // behind the lit code of a channel
 };
 
 static struct taken ring[2];
@@ -462,7 +464,7 @@ SELDOM static void show_late(struct sg_reading *reading, struct late *late)
     memset(late, 0, sizeof *late);
 }
 
-HOT uint8_t sense_take(struct hal_cycle *cycle)
+uint8_t sense_take(struct hal_cycle *cycle)
 {
     struct sg_reading *reading = &cycle->reading;
     const struct taken *from;
@@ -490,11 +492,13 @@ HOT uint8_t sense_take(struct hal_cycle *cycle)
     const uint16_t *code = &from->code[1];
     for (uint8_t phase = 0; phase < 3; phase++) {
         const uint8_t a = pgm_read_byte(place++), b = pgm_read_byte(place++);
-        reading->lit_code[a] = *code++;
-        reading->lit_code[b] = *code++;
-        code += phase == 0;
-        reading->unlit_code[a] = *code++;
-        reading->unlit_code[b] = *code++;
+        uint16_t *const to_a = &reading->lit_code[a], *const to_b = &reading->lit_code[b];
+        *to_a = *code++;
+        *to_b = *code++;
+        if (phase == 0)
+            code++;
+        to_a[UNLIT_AFTER] = *code++;
+        to_b[UNLIT_AFTER] = *code++;
     }
     reading->held_code = from->code[0] < HELD_LEAST ? 0 : from->code[0];
     look_at_supply(done, reading->held_code);
