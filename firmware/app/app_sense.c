@@ -219,7 +219,7 @@ void app_sense_cycle(const struct hal_cycle *cycle)
     // One or the other: what a cycle takes at most counts.
     if (health)
         look_at(reading);
-    else if (app.exposure_auto && sg_expose_cycle(&app.expose, reading->lit_code, reading->unlit_code, reading->exposure_cycles)) {
+    else if (app.exposure_auto && sg_expose_cycle(&app.expose, reading, timing.wiring)) {
         if (far_from(reading->exposure_cycles))
             wished = EXPOSE_CYCLES;
         else if (!wished)

@@ -12,7 +12,7 @@ enum {
     // A blink leaves the calibrated range before the lids are where they were: this long after the last frame
     // out of range a gaze may look right and be wrong.
     RECOVERY_256US = 122,
-    BLINK_256US = 16,                   // out of range for so long, and one
+    BLINK_256US = 43,                   // out of range for so long
     // No eye turns by more than a degree in a millisecond. What moves by that and so much more is noise, such as
     // sunlight beside little of ours makes of a gaze; its neighbours are no better, whatever they say.
     JUMP_DEG_Q1 = 3,                    // a degree in 1024 us is one in 512 us
@@ -47,7 +47,7 @@ static uint16_t previous_exposure[HAL_CHANNELS];
 // A frame is never 65 ms: bytes tell times apart.
 static uint8_t before_256us;            // when the frame before was sensed
 static uint8_t hold_256us;              // no gaze is called valid for so long
-static uint8_t out_256us;               // for so long out of range, and one; at most a little more than BLINK
+static uint8_t out_256us;               // for so long out of range, at most BLINK_256US
 static uint8_t before_deg_q1[2];        // the gaze before, modulo 128 deg
 
 void app_count(uint16_t *counter)
@@ -196,24 +196,28 @@ static void finish_frame(const struct hal_cycle *cycle)
     } else {
         hold_256us = 0;
     }
+    uint8_t odd = flags & SG_FLAG_EXPOSURE;
+    if (app.exposure_auto && app.expose.acquiring) {    // some are far too short
+        flags |= SG_FLAG_RECOVERING;
+        odd = 1;
+    }
 
     HAL_BEGIN(HAL_SECTION_INFER);
     sg_track_infer(model, app.feature, flags, recentre, &out->gaze);
     HAL_END(HAL_SECTION_INFER);
-    // Where an exposure follows the light, features say nothing about the lids.
-    if ((out->gaze.flags & SG_FLAG_OUT_OF_RANGE)
-        && !(flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED | SG_FLAG_EXPOSURE))) {
-        // Lids stay away for long; noise does not, nor does it reach means of several cycles.
-        out_256us = (uint8_t)(out_256us ? out_256us + since : 1);
-        if (app.pause || app_timing()->repeats > 1 || out_256us >= BLINK_256US) {
+    // Lids stay away for long; noise does not, nor does light that has just changed. Where an exposure follows it,
+    // features say nothing about the lids.
+    if (!(out->gaze.flags & SG_FLAG_OUT_OF_RANGE) || odd || (flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED))) {
+        out_256us = 0;
+    } else {
+        out_256us = (uint8_t)(out_256us + since);
+        if (out_256us >= BLINK_256US) {
             hold_256us = RECOVERY_256US;
             out_256us = BLINK_256US;
         }
-    } else {
-        out_256us = 0;
     }
     const uint8_t most = (uint8_t)((since >> 1) + JUMP_DEG_Q1);    // at most 125
-    if (jumps(out->gaze.azimuth_deg_q7, 0, most) | jumps(out->gaze.elevation_deg_q7, 1, most)) {
+    if ((jumps(out->gaze.azimuth_deg_q7, 0, most) | jumps(out->gaze.elevation_deg_q7, 1, most)) && !odd) {
         if (hold_256us < CALM_256US)
             hold_256us = CALM_256US;
         flags |= SG_FLAG_RECOVERING;

@@ -1,21 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "sg_expose.h"
 
+#define ONCE __attribute__((noinline))   // in flash
+
 enum {
     CHANNELS = 6,
-    BRIGHT_Q2 = SG_EXPOSE_BRIGHT_CODE >> 2, // codes / 4
+    GOAL_Q2 = SG_EXPOSE_GOAL_CODES >> 2,    // codes / 4
+    BRIGHT_Q2 = SG_EXPOSE_BRIGHT_CODE >> 2,
     RISEN_Q2 = 12,              // less than that fits above the goal
     FREED_Q2 = 58,              // a quarter of the range: worth a longer exposure
-    WORTH_Q2 = 160,             // a load below it is
+    WORTH_Q2 = 150,             // a load below it is, if it lasts
+    DIM_Q2 = 40,                // and one below this, a sixth of the goal, soon
     FALL_CYCLES = 3,            // the dark of a lamp that flickers to nothing at 100 Hz is shorter
     FALL_LEAST_Q2 = 8,          // of a peak, below which a fall says nothing
     CAUTION_MOST = 6,
-    ACQUIRED_A_CYCLE = 2,
     LEAST_MOST = 1024,          // a port that takes more instead has other reasons
-    SETTLED_LOOKS = 4,
-    SOON_LOOKS = 5,             // 30 ms: a crest comes within 10 ms
     WATCH_LOOKS = 5,            // 30 ms: five phases of a period of 10 ms
-    SLOW_ROUNDS = 170,          // 1 s at 6 ms a round
 };
 
 static uint16_t clipped(uint16_t cycles, uint16_t most)
@@ -47,14 +47,14 @@ void sg_expose_taken(struct sg_expose *expose, const uint16_t exposure_cycles[6]
         struct sg_expose_led *led = &expose->led[i];
         const uint16_t asked = led->exposure_cycles, taken = exposure_cycles[i];
         if (taken > asked + (asked >> 2) && taken <= LEAST_MOST)
-            led->least_q4 = (uint8_t)(taken >> 4);
+            led->least_q3 = (uint8_t)(taken >> 3);
         led->exposure_cycles = taken;
     }
 }
 
-static uint16_t within(const struct sg_expose_led *led, uint16_t cycles)
+ONCE static uint16_t within(const struct sg_expose_led *led, uint16_t cycles)
 {
-    const uint16_t least = (uint16_t)(led->least_q4 << 4);
+    const uint16_t least = (uint16_t)(led->least_q3 << 3);
     return clipped(cycles < least ? least : cycles, led->most_cycles);
 }
 
@@ -75,47 +75,56 @@ static uint16_t stretch_q6(uint16_t load)
     return quotient;
 }
 
-// Exposure that would have met the goal with this much unlit and this much of ours.
-static uint16_t wanted(const struct sg_expose_led *led, uint16_t unlit, uint16_t signal)
+// Exposure that would have met the goal with this much unlit and this much of ours, collected in `then_cycles`.
+static uint16_t wanted(const struct sg_expose_led *led, uint16_t then_cycles, uint16_t unlit, uint16_t signal)
 {
     const uint16_t stretch = stretch_q6((uint16_t)(unlit + 2U * signal));
-    const uint32_t cycles = ((uint32_t)led->exposure_cycles * stretch) >> 6;
+    const uint32_t cycles = ((uint32_t)then_cycles * stretch) >> 6;
     const uint16_t whole = cycles > UINT16_MAX >> 3 ? UINT16_MAX >> 3 : (uint16_t)cycles;
     return within(led, (uint16_t)(whole - ((uint16_t)(whole * led->caution) >> 3)));
 }
 
 // Take an exposure. Returns 1 if it is another one.
-static uint8_t change(struct sg_expose_led *led, uint16_t exposure_cycles, uint8_t stage)
+ONCE static uint8_t change(struct sg_expose_led *led, uint16_t exposure_cycles, uint8_t stage)
 {
     led->stage = stage;
     led->streak = 0;
-    led->age = 0;
     if (exposure_cycles == led->exposure_cycles)
         return 0;
     led->exposure_cycles = exposure_cycles;
     led->unlit_peak = 0;
+    led->signal_peak = UINT8_MAX;       // what was the brightest is not known: wait for the next patience
     return 1;
 }
 
-// A full sample gives a direction, no measure: it may be older than a better correction.
-static uint8_t full(struct sg_expose_led *led, uint16_t unlit, uint16_t then_cycles)
+// A full sample gives a direction, no measure.
+static uint8_t full(struct sg_expose_led *led, uint16_t unlit)
 {
-    const uint8_t shift = unlit >= SG_EXPOSE_SATURATED_CODE ? 4 : 3;
-    const uint16_t now = within(led, then_cycles >> shift);
+    const uint8_t settled = led->stage == SG_EXPOSE_TRACK;
+    // Gaze or lids: no more than is needed.
+    const uint8_t ours = settled && (uint8_t)(unlit >> 2) <= led->unlit_then + RISEN_Q2;
+    const uint8_t shift = unlit >= SG_EXPOSE_SATURATED_CODE ? 4 : ours ? 1 : 3;
+    const uint16_t now = within(led, led->exposure_cycles >> shift);
     if (now >= led->exposure_cycles)
         return 0;
-    if (led->stage == SG_EXPOSE_ACQUIRE || led->age >= SOON_LOOKS)
-        return change(led, now, SG_EXPOSE_ACQUIRE);
-    const uint8_t again = led->caution != 0;
-    if (led->caution < CAUTION_MOST)
-        led->caution++;
-    return change(led, now, again ? SG_EXPOSE_WATCH : SG_EXPOSE_ACQUIRE);
+    uint8_t stage = ours ? SG_EXPOSE_VERIFY : SG_EXPOSE_ACQUIRE;
+    if (!settled && led->stage != SG_EXPOSE_ACQUIRE) {
+        if (led->caution)
+            stage = SG_EXPOSE_WATCH;
+        if (led->caution < CAUTION_MOST)
+            led->caution++;
+    }
+    return change(led, now, stage);
 }
 
 // A sample that decides at once. Returns 1 if the exposure changed.
-static uint8_t acquire(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
+static uint8_t acquire(struct sg_expose_led *led, uint16_t lit, uint16_t unlit, uint8_t late_cycles)
 {
-    const uint16_t now = wanted(led, unlit, lit > unlit ? (uint16_t)(lit - unlit) : 0);
+    // Twice, as the goal has the lit code.
+    const uint16_t then = (uint16_t)(led->exposure_cycles - 2U * late_cycles);
+    if (late_cycles > led->exposure_cycles >> 3)
+        return 0;
+    const uint16_t now = wanted(led, then, unlit, lit > unlit ? (uint16_t)(lit - unlit) : 0);
     if (now < led->exposure_cycles - (led->exposure_cycles >> 4)
         || now > led->exposure_cycles + (led->exposure_cycles >> 2))
         return change(led, now, (uint8_t)(led->stage + 1U));
@@ -126,12 +135,14 @@ static uint8_t acquire(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
 // An exposure for the ambient light of late and this signal, / 4.
 static uint8_t choose(struct sg_expose_led *led, uint8_t signal_q2)
 {
-    const uint16_t now = wanted(led, (uint16_t)(led->unlit_peak << 2), (uint16_t)(signal_q2 << 2));
+    const uint16_t now = wanted(led, led->exposure_cycles, (uint16_t)(led->unlit_peak << 2),
+                                (uint16_t)(signal_q2 << 2));
     return change(led, now, SG_EXPOSE_VERIFY);
 }
 
 // The exposure in force, looked at once a round. Returns 1 if it changed.
-static uint8_t look(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
+static uint8_t look(const struct sg_expose *expose, struct sg_expose_led *led, uint8_t bright, uint16_t lit,
+                    uint16_t unlit)
 {
     const uint8_t unlit_q2 = (uint8_t)(unlit >> 2);
     const uint8_t signal_q2 = lit > unlit ? (uint8_t)((uint16_t)(lit - unlit) >> 2) : 0;
@@ -139,18 +150,21 @@ static uint8_t look(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
         led->unlit_peak = unlit_q2;
     else
         led->unlit_peak = (uint8_t)(led->unlit_peak - ((uint8_t)(led->unlit_peak - unlit_q2 + 15U) >> 4));
-    if (led->age != UINT8_MAX)
-        led->age++;
+    if (signal_q2 > led->signal_peak)
+        led->signal_peak = signal_q2;
     if (led->stage == SG_EXPOSE_WATCH) {
         if (++led->streak < WATCH_LOOKS)
             return 0;
         return choose(led, signal_q2);
     }
     if (led->stage == SG_EXPOSE_VERIFY) {
+        // What fits once may be the brightest there is.
+        const uint8_t room = led->unlit_peak < GOAL_Q2 ? (uint8_t)(GOAL_Q2 - led->unlit_peak) >> 1 : 0;
         led->unlit_then = led->unlit_peak;
-        led->signal_then = signal_q2;
-        led->stage = SG_EXPOSE_TRACK;
+        led->signal_then = signal_q2 > room ? room : signal_q2;
     }
+    if (led->stage < SG_EXPOSE_TRACK)
+        led->stage++;
     const uint16_t load_then_q2 = (uint16_t)(led->unlit_peak + 2U * led->signal_then);
     const uint8_t longer = led->exposure_cycles < led->most_cycles;
     // What ambient light did, with the signal as it was when the exposure was chosen: gaze has no part in it.
@@ -159,16 +173,24 @@ static uint8_t look(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
     if (risen || freed)
         return choose(led, led->signal_then);
     // What our own light did must last.
-    if (lit > SG_EXPOSE_BRIGHT_CODE)
+    if (bright)
         led->streak = (int8_t)(led->streak > 0 ? led->streak + 1 : 1);
-    else if (longer && (uint16_t)(2U * signal_q2 + (signal_q2 >> 3)) < led->signal_then
-             && (uint16_t)(led->unlit_peak + 2U * signal_q2) < WORTH_Q2)
+    else if (longer && (uint16_t)(led->unlit_peak + 2U * signal_q2) < DIM_Q2)
         led->streak = (int8_t)(led->streak < 0 ? led->streak - 1 : -1);
     else
         led->streak = 0;
-    if (led->streak < SG_EXPOSE_PATIENCE_BRIGHT && led->streak > -SG_EXPOSE_PATIENCE_DIM)
+    if (led->streak >= SG_EXPOSE_PATIENCE_BRIGHT)
+        return change(led, within(led, (uint16_t)(led->exposure_cycles - (led->exposure_cycles >> 2))),
+                      SG_EXPOSE_VERIFY);
+    if (led->streak <= -SG_EXPOSE_PATIENCE_DIM)
+        return choose(led, signal_q2);
+    if (expose->rounds | expose->times)
         return 0;
-    return choose(led, signal_q2);
+    const uint8_t peak = led->signal_peak;
+    led->signal_peak = signal_q2;
+    if (longer && (uint16_t)(led->unlit_peak + 2U * peak) < WORTH_Q2)
+        return choose(led, peak);
+    return 0;
 }
 
 // Has the light around fallen away? Looks in consecutive cycles, each at another sensor, say so. Then all
@@ -190,41 +212,52 @@ static void watch_ambient(struct sg_expose *expose, const struct sg_expose_led *
     }
 }
 
-static uint8_t is_full(uint16_t lit, uint16_t unlit)
+// The channel sampled right before, whose code the sample capacitor brings along (see sg_light.h); itself: none.
+static uint8_t before(uint8_t i, uint8_t wiring)
 {
-    return lit >= SG_EXPOSE_SATURATED_CODE || unlit >= SG_EXPOSE_SATURATED_CODE;
+    if (wiring)
+        return i < 3 ? i : i - 3;
+    return i == 0 || i == 3 || i == 4 ? 5 - i : i;
 }
 
-// What does not wait for its turn. Returns 1 if an exposure changed.
-static uint8_t at_once(struct sg_expose *expose, const uint16_t lit_code[6], const uint16_t unlit_code[6],
-                       const uint16_t exposure_cycles[6])
+// A code without its share of the one before, s = 14 / 46, over the rest, for which the goal leaves room:
+// (code - s before) / (1 - s).
+ONCE static uint16_t own(uint16_t code, uint16_t code_before)
 {
-    uint8_t changed = 0, acquired = 0, left = 0, drowned = 0;
-    for (uint8_t i = 0; i < CHANNELS; i++)
-        drowned = (uint8_t)(drowned + (unlit_code[i] >= SG_EXPOSE_SATURATED_CODE));
-    struct sg_expose_led *led = expose->led;
-    for (uint8_t i = 0; i < CHANNELS; i++, led++) {
-        const uint16_t lit = lit_code[i], unlit = unlit_code[i];
-        // Two full without our light: so much of it came that the others will be, and all change at once.
-        if (drowned >= 2 && exposure_cycles[i] == led->exposure_cycles && led->stage == SG_EXPOSE_TRACK
-            && led->age >= SETTLED_LOOKS) {
-            changed |= full(led, SG_EXPOSE_SATURATED_CODE, exposure_cycles[i]);
-        } else if (is_full(lit, unlit)) {
-            changed |= full(led, unlit, exposure_cycles[i]);
-        } else if (led->stage <= SG_EXPOSE_REFINE && acquired < ACQUIRED_A_CYCLE
-                   && exposure_cycles[i] == led->exposure_cycles) {
-            changed |= acquire(led, lit, unlit);
-            acquired++;
-        }
-        left |= led->stage <= SG_EXPOSE_REFINE;
-    }
-    expose->acquiring = left;
-    return changed;
+    const int16_t more = (int16_t)(code - code_before) >> 1;
+    const int16_t alone = (int16_t)(code + more - (more >> 3));
+    return alone < 0 ? 0 : (uint16_t)alone;
 }
 
-static void forget_caution(struct sg_expose *expose)
+// A channel in this cycle; what waits for its turn only if it is that. Returns 1 if its exposure changed.
+static uint8_t visit(struct sg_expose *expose, const struct sg_reading *reading, uint8_t wiring, uint8_t i)
 {
-    expose->rounds = 0;
+    struct sg_expose_led *led = &expose->led[i];
+    if (reading->exposure_cycles[i] != led->exposure_cycles)
+        return 0;
+    uint16_t lit = reading->lit_code[i], unlit = reading->unlit_code[i];
+    // Two full without our light: so much of it came that the others will be, and all change at once.
+    if (expose->drowned >= 2 && led->stage == SG_EXPOSE_TRACK)
+        unlit = SG_EXPOSE_SATURATED_CODE;
+    if (lit >= SG_EXPOSE_SATURATED_CODE || unlit >= SG_EXPOSE_SATURATED_CODE)
+        return full(led, unlit);
+    const uint8_t bright = lit > SG_EXPOSE_BRIGHT_CODE;
+    const uint8_t first = before(i, wiring);
+    lit = own(lit, reading->lit_code[first]);
+    unlit = own(unlit, reading->unlit_code[first]);
+    if (i == expose->next && led->stage > SG_EXPOSE_REFINE)
+        watch_ambient(expose, led, unlit);
+    if (led->stage <= SG_EXPOSE_REFINE)
+        return acquire(led, lit, unlit, reading->late_lit_cycles[i]);
+    return i == expose->next ? look(expose, led, bright, lit, unlit) : 0;
+}
+
+static void count_round(struct sg_expose *expose)
+{
+    if (++expose->rounds)
+        return;
+    if (++expose->times == SG_EXPOSE_PATIENCE_TIMES)
+        expose->times = 0;
     for (uint8_t i = 0; i < CHANNELS; i++) {
         struct sg_expose_led *led = &expose->led[i];
         led->caution = (uint8_t)(led->caution - (led->caution != 0));
@@ -237,27 +270,28 @@ static inline uint8_t raised(uint16_t code)
     return (uint8_t)((uint16_t)(code + (1024U - SG_EXPOSE_SATURATED_CODE)) >> 8);
 }
 
-uint8_t sg_expose_cycle(struct sg_expose *expose, const uint16_t lit_code[6], const uint16_t unlit_code[6],
-                        const uint16_t exposure_cycles[6])
+uint8_t sg_expose_cycle(struct sg_expose *expose, const struct sg_reading *reading, uint8_t wiring)
 {
-    const uint8_t any = raised(lit_code[0]) | raised(lit_code[1]) | raised(lit_code[2]) | raised(lit_code[3])
-                      | raised(lit_code[4]) | raised(lit_code[5]);
-    uint8_t changed = 0;
-    if ((any & 4U) || expose->acquiring)
-        changed = at_once(expose, lit_code, unlit_code, exposure_cycles);
-
-    uint8_t next = expose->next;
-    if (next == 0) {
-        next = CHANNELS;
-        if (++expose->rounds >= SLOW_ROUNDS)
-            forget_caution(expose);
+    const uint16_t *code = reading->lit_code;
+    const uint8_t any = raised(code[0]) | raised(code[1]) | raised(code[2]) | raised(code[3]) | raised(code[4])
+                      | raised(code[5]);
+    if (expose->next == 0) {
+        expose->next = CHANNELS;
+        count_round(expose);
     }
-    next--;
-    expose->next = next;
-    struct sg_expose_led *led = &expose->led[next];
-    const uint16_t lit = lit_code[next], unlit = unlit_code[next];
-    if (led->stage < SG_EXPOSE_VERIFY || exposure_cycles[next] != led->exposure_cycles || is_full(lit, unlit))
-        return changed;
-    watch_ambient(expose, led, unlit);
-    return changed | look(led, lit, unlit);
+    expose->next--;
+    expose->drowned = 0;
+    if (!(any & 4U) && !expose->acquiring)
+        return visit(expose, reading, wiring, expose->next);
+    expose->acquiring = 0;
+    uint8_t drowned = 0;
+    for (uint8_t i = 0; i < CHANNELS; i++)
+        drowned = (uint8_t)(drowned + (reading->unlit_code[i] >= SG_EXPOSE_SATURATED_CODE));
+    expose->drowned = drowned;
+    uint8_t changed = 0;
+    for (uint8_t i = 0; i < CHANNELS; i++) {
+        changed |= visit(expose, reading, wiring, i);
+        expose->acquiring |= expose->led[i].stage <= SG_EXPOSE_REFINE;
+    }
+    return changed;
 }

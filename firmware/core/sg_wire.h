@@ -66,7 +66,7 @@ enum sg_flag {
     SG_FLAG_STARVED = 16,       // a channel collected too little light to say anything
     SG_FLAG_EXPOSURE = 32,      // an exposure changed since the previous frame
     SG_FLAG_FAULT = 64,         // a channel or the board is at fault: sg_status names it
-    SG_FLAG_RECOVERING = 128,   // a frame shortly before was out of range: the lids may still be opening
+    SG_FLAG_RECOVERING = 128,   // out of range shortly before: the lids may still be opening; or exposures are being found
 };
 
 enum sg_exposure_op {

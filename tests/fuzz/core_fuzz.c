@@ -306,7 +306,7 @@ static void fuzz_sense(void)
             sg_health_look(&health, (uint8_t)(i % 6), &sight);
             HOLDS(health.fault[i % 6] < 16, "faults have names");
         }
-        sg_expose_cycle(&expose, reading.lit_code, reading.unlit_code, reading.exposure_cycles);
+        sg_expose_cycle(&expose, &reading, (uint8_t)(i & 1));
         for (int j = 0; j < SG_LIGHT_CHANNELS; j++) {
             const uint16_t now = expose.led[j].exposure_cycles;
             HOLDS(now >= SG_EXPOSE_MIN_CYCLES && now <= SG_EXPOSE_MAX_CYCLES, "limits of an exposure");

@@ -57,7 +57,7 @@ def exposure_bytes():
         reading = reading_of(lit, exposure)
         lib.sg_light_add(light, reading)
         out += bytes([lib.sg_light_features(light, feature)]) + bytes(ffi.buffer(feature))
-        lib.sg_expose_cycle(expose, reading.lit_code, reading.unlit_code, reading.exposure_cycles)
+        lib.sg_expose_cycle(expose, reading, lib.SG_WIRING_LEDS)
         out += b"".join(led.exposure_cycles.to_bytes(2, "little") for led in expose.led)
     return out
 

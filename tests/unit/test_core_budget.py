@@ -83,9 +83,10 @@ def expose_case():
     expose = ffi.new("struct sg_expose *")
     lib.sg_expose_start(expose, EXPOSURES, EXPOSURES)
     for _ in range(20):
-        lib.sg_expose_cycle(expose, [320] * 6, [5] * 6, EXPOSURES)
-    return {"body": "uint16_t code[18]; memcpy(code, in, 36);"
-                    "out[0] = sg_expose_cycle(&expose, code, code + 6, code + 12);",
+        lib.sg_expose_cycle(expose, ffi.new("struct sg_reading *", {
+            "lit_code": [320] * 6, "unlit_code": [5] * 6, "exposure_cycles": EXPOSURES}), lib.SG_WIRING_LEDS)
+    return {"body": "struct sg_reading reading = { .held_code = 0 }; memcpy(&reading, in, 36);"
+                    "out[0] = sg_expose_cycle(&expose, &reading, 0);",
             "inputs": codes.astype(np.uint16), "out_bytes": 1, "includes": ["sg_expose.h", "sg_rom.h"],
             "setup": "static struct sg_expose expose; for (uint8_t k = 0; k < sizeof expose; k++)"
                      "    ((uint8_t *)&expose)[k] = sg_rom_byte(&settled[k], CASE_SPACE);",

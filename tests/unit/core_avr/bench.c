@@ -86,7 +86,7 @@ static void expose(void)
         const uint8_t flags = sg_light_features(&light, feature);
         END(FEATURES);
         BEGIN(EXPOSE);
-        sg_expose_cycle(&exposures, reading.lit_code, reading.unlit_code, reading.exposure_cycles);
+        sg_expose_cycle(&exposures, &reading, 0);
         END(EXPOSE);
         put(&flags, 1);
         put(feature, sizeof feature);
