@@ -120,6 +120,11 @@ void app_on_byte(uint8_t byte, uint32_t zero_us)
         app_request(&head, (uint8_t)n, zero_us);
 }
 
+static uint8_t acquires(void)
+{
+    return app.exposure_auto && app.expose.acquiring;
+}
+
 // Compared with the frame before, as sensed.
 static uint8_t exposures_changed(const struct sg_reading *reading)
 {
@@ -197,7 +202,7 @@ static void finish_frame(const struct hal_cycle *cycle)
         hold_256us = 0;
     }
     uint8_t odd = flags & SG_FLAG_EXPOSURE;
-    if (app.exposure_auto && app.expose.acquiring) {    // some are far too short
+    if (acquires()) {               // some are far too short
         flags |= SG_FLAG_RECOVERING;
         odd = 1;
     }
@@ -255,6 +260,8 @@ static void take(const struct hal_cycle *cycle)
     }
     left = cycle->left;
     under_way = left != 0;
+    if (acquires())                 // the light that moved rests in all likelihood: no reason to interpolate
+        app.light.moving = 0;
     sg_light_add(&app.light, &cycle->reading);
 }
 

@@ -142,14 +142,21 @@ def test_one_led_ten_times_brighter_than_the_rest_has_its_own_exposure(worn, tmp
     assert lit.max() < 1000 and lit[brighter] > 200 and lit.min() > 20
 
 
-def test_a_step_of_a_thousand_in_the_middle_of_an_exposure(worn):
-    """12 up, 12 down at cycles that no exposure knows: few saturated frames, then the new level's error."""
+@pytest.mark.parametrize("repeats, least, times", [(4, (0.98, 0.98), 1.1), (1, (0.4, 0.95), 1.2)])
+def test_a_step_of_a_thousand_in_the_middle_of_an_exposure(worn, repeats, least, times):
+    """12 up, 12 down at cycles that no exposure knows: few saturated frames, then the new level's error.
+
+    least   share of valid frames, in 2 uA and in 2 nA. At a cycle a frame the sunlight's noise is 1 deg RMS: what
+            moves by it faster than an eye is not called a gaze.
+    """
     one = worn()
-    low, high, gap_us = 2.0, 2000.0, 100_000
+    one.device.settings(repeats=repeats)
+    low, high, frame_us = 2.0, 2000.0, 1000 * repeats
+    gap_us = 40_000 + 60 * frame_us
     rng = np.random.default_rng(1)
     one.control.ambient(low)
     one.settle()
-    moment, steps = one.now_us() + 20_000, []
+    moment, steps = one.now_us() + 200_000, []
     for _ in range(12):
         for na in (high, low):
             moment += gap_us + int(rng.integers(0, 1000))
@@ -157,18 +164,18 @@ def test_a_step_of_a_thousand_in_the_middle_of_an_exposure(worn):
             steps.append((moment, na))
     frames = one.run((moment - one.now_us() + gap_us) * 1e-6)
     one.never_wild(frames, "steps")
-    times, error = one.times(frames), one.error(frames)
+    moments, error = one.times(frames), one.error(frames)
     saturated = (flags(frames) & lib.SG_FLAG_SATURATED) != 0
-    for name, level in (("up", high), ("down", low)):
-        after = [times - step for step, na in steps if na == level]
+    for name, level, share in (("up", high, least[0]), ("down", low, least[1])):
+        after = [moments - step for step, na in steps if na == level]
         most = max(saturated[(since >= 0) & (since < gap_us - 5000)].sum() for since in after)
-        soon = np.concatenate([error[(since >= 10_500) & (since < 25_000)] for since in after])
-        later = np.concatenate([error[(since >= 50_000) & (since < 95_000)] for since in after])
+        soon = np.concatenate([error[(since >= 10.5 * frame_us) & (since < 30 * frame_us)] for since in after])
+        later = np.concatenate([error[(since >= 40 * frame_us) & (since < gap_us - 5000)] for since in after])
         shares = np.isfinite(soon).mean(), np.isfinite(later).mean()
         means = [np.nanmean(part) if np.isfinite(part).any() else np.inf for part in (soon, later)]
-        print(f"{name}: at most {most} saturated; after 10 frames, after 50: {means} deg, valid {shares}")
+        print(f"{name}: at most {most} saturated; after 10 frames, after 40: {means} deg, valid {shares}")
         assert most <= 5
-        assert min(shares) > 0.8 and means[0] <= 1.2 * means[1]
+        assert min(shares) > share and means[0] <= times * means[1]
 
 
 @pytest.mark.parametrize("rate_hz, repeats, hz, times", [

@@ -189,11 +189,12 @@ def test_a_step_of_ambient_leaves_the_features_where_they_were_within_ten_frames
     rng, gap_us = np.random.default_rng(3), 80_000
     began_us, ping = nano.control.time().us, device.ping()
     offset_us = device.clock.unwrap(ping.tx_us) - nano.control.time().us
-    moments = [began_us + 30_000 + gap_us * k + int(rng.integers(0, 1000)) for k in range(20)]
+    # Exposures are chosen anew when streams begin.
+    moments = [began_us + 200_000 + gap_us * k + int(rng.integers(0, 1000)) for k in range(20)]
     for k, moment in enumerate(moments):
         cycle = moment * CYCLES_PER_US + int(rng.integers(0, 16))
         nano.control.set_at(cycle, "ambient_na", (2000.0, 2.0)[k % 2])
-    frames = frames_of(device, 1650)
+    frames = frames_of(device, 1820)
     times, found = np.array([frame.t_us for frame in frames]) - offset_us, features(frames)
     saturated = flags_of(frames) & lib.SG_FLAG_SATURATED != 0
     for name, steps in (("up", moments[0::2]), ("down", moments[1::2])):
