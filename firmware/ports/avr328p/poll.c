@@ -30,11 +30,11 @@ const uint8_t *hal_slot(uint8_t slot)
 
 void hal_start(struct hal_timing *timing, uint16_t exposure_cycles[HAL_CHANNELS])
 {
-    serial_start();
-    sense_start(timing, exposure_cycles);
-    boot_watchdog_on();
     while (!boot_look_at_stack()) {
     }
+    sense_start(timing, exposure_cycles);
+    boot_watchdog_on();
+    serial_start();             // last: nobody takes its bytes before interrupts are on
     sei();
 }
 
