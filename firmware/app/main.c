@@ -19,8 +19,8 @@ enum {
     CALM_256US = 32,
     BYTES_US = 130,                     // a look at the line
     REQUEST_US = 188,                   // a request, and its answer
-    // One that makes a frame late is heard after so many cycles, if no frame is late yet: it takes 500 us, and
-    // readings are lost when work is behind by a whole period.
+    // One that makes a frame late is heard after so many cycles, if no frame is late yet: it takes 500 us, a long
+    // one and receiving the next 2 us a byte more, and readings are lost when work is behind by a whole period.
     PATIENCE_CYCLES = 6,
     PATIENCE_MOST_CYCLES = 40,          // whatever happens
 };
@@ -101,7 +101,8 @@ uint8_t app_listens(uint8_t byte)
     if (asked.waiting)
         return 0;
     if (app_time_for(byte || !app.link.fill ? BYTES_US : REQUEST_US)
-        || (waited > PATIENCE_CYCLES && (waited > PATIENCE_MOST_CYCLES || app_time_for(0))))
+        || (waited > PATIENCE_CYCLES
+            && (waited > PATIENCE_MOST_CYCLES || app_time_for((uint8_t)(app.link.fill << 1)))))
         return 1;
     refused = 1;
     return 0;

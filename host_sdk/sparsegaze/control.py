@@ -220,7 +220,7 @@ class VirtualControl:
         """{name: count} since power-on, and of light and sleep since counters_clear().
 
         lit_cycles_0..5, longest_pulse_cycles, asleep_cycles in CPU cycles; most_lit: emitters at once;
-        led_charge_nc: what their drivers gave, nC.
+        led_charge_nc: what their drivers gave, nC; longest_rx_cycles: that a byte waited in the receiver.
         """
         items = (item.split("=", 1) for item in self.command("counters").split())
         return {key: int(float(value)) for key, value in items}

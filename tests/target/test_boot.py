@@ -3,6 +3,7 @@
 
 import pytest
 
+from sparsegaze import wire
 from sparsegaze.wire import lib
 
 
@@ -33,6 +34,23 @@ def test_older_bootloader_starts_and_restarts_the_firmware(board):
     assert status.reset_cause == lib.SG_RESET_WATCHDOG and status.boot_count == boots + 1
     device.link.sleep(0.2)
     assert device.status().frames > status.frames and nano.control.counters()["wdt_resets"] == 0
+
+
+def test_bytes_that_come_while_it_starts_are_not_counted_lost(board):
+    """The receiver is off until somebody takes its bytes: what came before is nobody's, a half packet at most."""
+    nano, device = board(auto_reset=False)
+    link = device.link
+    for phase in range(12):
+        nano.control.reset()
+        link.sleep(1e-4 * phase)
+        decoder, found, patience, seq = wire.Decoder(), [], link.now() + 3.0, 0
+        while not found and link.now() < patience:
+            seq += 1
+            link.write(b"\0" + wire.encode(lib.SG_MSG_STATUS, seq))
+            found = [wire.parse(wire.Status, packet.body) for packet in decoder.feed(link.read(4096, 0.0006))
+                     if packet.type == lib.SG_MSG_STATUS | lib.SG_REPLY]
+        assert found and found[0].rx_overrun == 0 and found[0].rx_bad <= 1
+        assert 100 < found[0].stack_free < 1000         # known before the first frame
 
 
 def test_boots_are_counted_through_power_cycles(board):

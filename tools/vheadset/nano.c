@@ -172,6 +172,7 @@ static void before_cycle(void *param, uint64_t cycle)
 void nano_clear_counters(struct nano *nano)
 {
     lamps_clear(&nano->leds.lamps, nano->avr->cycle);
+    nano->uart.longest_rx = 0;
     nano->asleep_cycles = 0;
 }
 

@@ -61,10 +61,10 @@ static avr_cycle_count_t line_stop(avr_t *avr, avr_cycle_count_t when, void *par
     u->line_busy = false;
     u->rx_bytes++;
     if (u->line_heard && (avr->data[UCSR0B] & RXEN)) {
-        struct uart_byte byte = {u->line_byte, false};
+        struct uart_byte byte = {u->line_byte, false, avr->cycle};
         if (!matched(u)) {
             uint64_t draw = noise_bits(u->seed, NOISE_LINE_RX, u->heard++);
-            byte = (struct uart_byte){(uint8_t)draw, draw >> 8 & 1};
+            byte = (struct uart_byte){(uint8_t)draw, draw >> 8 & 1, avr->cycle};
             u->rx_garbage++;
         }
         u->shift = byte;
@@ -153,6 +153,8 @@ static uint8_t read_data(avr_t *avr, avr_io_addr_t at, void *param)
     struct uart *u = param;
     if (u->held) {
         avr->data[at] = u->fifo[0].data;
+        if (avr->cycle - u->fifo[0].came > u->longest_rx)
+            u->longest_rx = avr->cycle - u->fifo[0].came;
         u->fifo[0] = u->fifo[1];
         u->held--;
         u->overrun = false;

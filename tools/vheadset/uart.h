@@ -20,7 +20,7 @@
 
 struct bridge;
 
-struct uart_byte { uint8_t data; bool framing_error; };
+struct uart_byte { uint8_t data; bool framing_error; uint64_t came; };
 
 struct uart {
     avr_t *avr;
@@ -42,6 +42,7 @@ struct uart {
     double line_free;             // cycle at which its stop bit ends
     uint64_t heard, garbled;      // count draws
     uint64_t overruns, rx_garbage, tx_garbage, tx_bytes, rx_bytes;
+    uint64_t longest_rx;          // cycles from a byte's stop bit until it was read
     // told about every byte that leaves, at the end of its stop bit; may be NULL
     void (*on_sent)(void *param, uint8_t byte, uint64_t cycle);
     void *on_sent_param;

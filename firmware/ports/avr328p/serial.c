@@ -249,7 +249,8 @@ uint8_t serial_poll(void)
     send_on();
     if (after_pending)
         carry_out();
-    if (rx_tail == rx_head || !app_listens(1))
+    const uint8_t waiting = (rx_head - rx_tail) & (RX_RING - 1);
+    if (!waiting || (waiting < RX_RING / 2 && !app_listens(1)))
         return 0;
     while (left-- && rx_tail != rx_head && !after_pending) {
         const uint8_t byte = rx_ring[rx_tail];
