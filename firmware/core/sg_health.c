@@ -4,8 +4,9 @@
 enum {
     CHANNELS = 6,
     OCTAVE = 4096,
-    // Above the middle of what was calibrated: shut lids of six simulated persons reach 1.48 octaves, wherever the
-    // eye looks behind them and whatever its pupil, a finger before the brightest LED makes 1.5 to 1.9.
+    // Above the middle of what was calibrated. Of eleven simulated persons ten never leave 1.5 octaves, lids shut or
+    // open, wherever the eye looks and whatever its pupil; lids of one that stay shut make 1.64 in one channel. A
+    // finger before the brightest LED makes 1.5 to 1.9, before the others more than 2.2.
     ABOVE = OCTAVE + OCTAVE / 2,
     MIDDLE_STEPS = 2048,        // of the model's range
     // A node without an LED has the pin's 6 pF and takes 14 of 20 parts of what the sample capacitor held:
