@@ -6,6 +6,7 @@ import pytest
 
 from sparsegaze import probe
 from sparsegaze.device import Device
+from sparsegaze.sensing import EXPOSURE_REST_S, wait_stored
 
 pytestmark = pytest.mark.timeout(900)
 
@@ -67,8 +68,11 @@ def test_only_low_power_lights_less_at_a_lower_rate(nano):
             fastest, slow = lit(rate_hz=0), lit(rate_hz=250)
             low = lit(rate_hz=250, power="low")
         finally:
+            written = device.status().eeprom_writes
             device.settings(rate_hz=0, power="normal")
             device.exposure(auto=True)
+            device.link.sleep(EXPOSURE_REST_S)      # what is stored is what the next to open the port gets
+            wait_stored(device, written)
     assert fastest > 0.2 and slow == pytest.approx(fastest, rel=0.02)
     assert low == pytest.approx(fastest / 4, rel=0.05)
 
