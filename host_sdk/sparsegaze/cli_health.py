@@ -39,10 +39,10 @@ def status(port, as_json):
     """
     from . import faults
     from .device import Device
-    from .doctor_port import SETTLE_S
+    from .doctor_port import settle
 
     with Device(port) as device:
-        device.link.sleep(SETTLE_S)
+        settle(device)
         now, exposure, settings, hello = device.status(), device.exposure(), device.settings(), device.hello
     found = faults.of(now, port)
     counters = {name: getattr(now, name) for name in COUNTERS}

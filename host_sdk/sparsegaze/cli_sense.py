@@ -55,22 +55,13 @@ class Microseconds(click.ParamType):
         return numbers * (CHANNELS // len(numbers))
 
 
-def cycles_a_frame(now):
-    """Sensing cycles whose mean a frame is: in normal power those fill the frame's time, 16 at most."""
-    from .wire import REPEATS, lib
-
-    if now.power == lib.SG_POWER_LOW or not now.period_us:
-        return now.repeats
-    return min(max(now.repeats, now.frame_period_us // now.period_us), REPEATS[-1])
-
-
 def settings_report(now):
     """A wire.Settings as plain values."""
     return {
         "rate_hz": now.frame_hz,
         "rate_limit_hz": now.rate_limit_hz,
         "repeats": now.repeats,
-        "cycles_a_frame": cycles_a_frame(now),
+        "cycles_a_frame": now.cycles_a_frame,
         "period_us": now.period_us,
         "frame_period_us": now.frame_period_us,
         "wiring": now.wiring_text,
@@ -83,7 +74,7 @@ def settings_report(now):
 def settings_lines(now, vectors, limits):
     """A wire.Settings in words; vectors of the model in use, 0: none; limits of rate_limits()."""
     with_model = f"the model of {vectors} vectors" if vectors else "no model"
-    count = cycles_a_frame(now)
+    count = now.cycles_a_frame
     cycles = "1 cycle" if count == 1 else f"the mean of {count} cycles"
     dark = now.frame_period_us - count * now.period_us
     pause = f", then {dark} us dark" if dark > count else ""

@@ -5,7 +5,8 @@ from . import faults
 from .doctor import Check
 from .errors import SparsegazeError
 
-SETTLE_S = 1.5  # after a reset: exposures find their level, faults show
+SETTLE_S = 1.5  # after a reset: exposures find their level, faults show,
+LOOK_CYCLES, SETTLE_MOST_S = 260, 6.0  # the last of six sensors after so many sensing cycles
 LOOK_S = 0.3
 MANY = 3  # sensors at fault together have a common cause
 WRONG_READINGS = 1.0  # of the six in a frame that are too dark, or full
@@ -18,12 +19,19 @@ def examine(port):
 
     try:
         with Device(port) as device:
-            device.link.sleep(SETTLE_S)
+            settle(device)
             before = device.status()
             device.link.sleep(LOOK_S)
             return checks_of(device, port, before)
     except SparsegazeError as error:
         return [Check("board", False, error.message, error.remedy)]
+
+
+def settle(device):
+    """Wait until an open device, maybe just reset, has found its exposures and looked at every sensor."""
+    now = device.settings()
+    looked_s = LOOK_CYCLES * now.frame_period_us * 1e-6 / max(now.cycles_a_frame, 1)
+    device.link.sleep(min(max(SETTLE_S, looked_s), SETTLE_MOST_S))
 
 
 def checks_of(device, port, before):

@@ -150,6 +150,13 @@ class Settings(record("struct sg_settings", "Settings")):
         return 1e6 / self.frame_period_us if self.frame_period_us else 0.0
 
     @property
+    def cycles_a_frame(self):
+        """Sensing cycles whose mean a frame is: in normal power those fill the frame's time, 16 at most."""
+        if self.power == lib.SG_POWER_LOW or not self.period_us:
+            return self.repeats
+        return min(max(self.repeats, self.frame_period_us // self.period_us), REPEATS[-1])
+
+    @property
     def most_hz(self):
         """rate_limit_hz, but not below the rate in force: the device rounds the one down, the other up."""
         return max(self.rate_limit_hz, int(self.frame_hz))

@@ -192,6 +192,19 @@ def test_a_board_that_sees_nothing_is_not_said_to_read(command, fake, monkeypatc
     assert code == 0 and text in out and remedy in out and "all six read" not in out
 
 
+SLOW = [({}, 1.5), ({"rate_hz": 60, "power": "low"}, 4.3), ({"rate_hz": 60}, 1.5)]
+
+
+@pytest.mark.parametrize("slow, waits_s", SLOW)
+@pytest.mark.parametrize("name", ["status", "doctor"])
+def test_slow_boards_are_given_the_time_to_look_at_every_sensor(command, fake, name, slow, waits_s):
+    device = fake(linear_model())
+    device.settings(**slow)
+    began = device.t_us
+    assert command(name, "PORT")[0] == 0
+    assert waits_s <= (device.t_us - began) * 1e-6 < waits_s + 0.5
+
+
 def test_many_open_sensors_point_to_the_rail_and_to_the_wiring_that_is_set(command, fake):
     fake(linear_model(), fault=(0, 1, 0, 1, 1, 1))
     code, out, _ = command("doctor", "PORT")
