@@ -66,11 +66,11 @@ enum plan_limits {
 };
 
 struct plan {
-    uint8_t event[PLAN_BYTES];
     uint16_t exposure_cycles[HAL_CHANNELS];
     uint16_t slot_cycles;
     uint8_t *first_mux;             // ADMUX of slot 0
     uint8_t end[3];                 // of each list, in `event`
+    uint8_t event[PLAN_BYTES];
 };
 
 // One cycle as the interrupt leaves it. Codes in the order of slots: of the first pair GND, lit a, b, GND,
