@@ -82,7 +82,7 @@ int sg_wire_encode(const struct sg_head *head, const void *body, size_t body_byt
     return sg_wire_encode_ring(head, body, (uint8_t)body_bytes, out, SG_WIRE_FRAME_MAX + 1, 0);
 }
 
-HOT int sg_wire_decode(uint8_t *frame, size_t n, struct sg_head *head, void *body)
+int sg_wire_decode(uint8_t *frame, size_t n, struct sg_head *head, void *body)
 {
     const uint8_t *at = frame, *const end = frame + n;
     uint8_t *packet = frame;    // never gets ahead: a group has one byte more than what it stands for
