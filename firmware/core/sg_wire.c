@@ -3,14 +3,14 @@
 
 #include "sg_err.h"
 
-// What runs for every frame: compiled for speed, whatever the rest is compiled for.
-#define HOT __attribute__((optimize("O2")))
+// What runs for every byte of a frame, in its place whatever the rest is compiled for.
+#define HOT static inline __attribute__((always_inline))
 
 // CRC-16, its bytes apart because that is how an AVR shifts.
 struct crc { uint8_t high, low; };
 
 // x^16 + x^12 + x^5 + 1 divides a byte at once: its quotient is the byte xor its own high nibble.
-HOT static inline void crc16_byte(struct crc *crc, uint8_t byte)
+HOT void crc16_byte(struct crc *crc, uint8_t byte)
 {
     uint8_t q = (uint8_t)(crc->high ^ byte);
     q = (uint8_t)(q ^ (q >> 4));
@@ -18,7 +18,7 @@ HOT static inline void crc16_byte(struct crc *crc, uint8_t byte)
     crc->low = (uint8_t)(q ^ (uint8_t)(q << 5));
 }
 
-HOT uint16_t sg_wire_crc16(uint16_t crc, const uint8_t *data, size_t n)
+uint16_t sg_wire_crc16(uint16_t crc, const uint8_t *data, size_t n)
 {
     struct crc now = { .high = (uint8_t)(crc >> 8), .low = (uint8_t)crc };
     for (const uint8_t *end = data + n; data != end;)
@@ -36,7 +36,7 @@ struct out {
     uint8_t group;
 };
 
-HOT static inline void out_byte(struct out *out, uint8_t byte)
+HOT void out_byte(struct out *out, uint8_t byte)
 {
     *out->next = byte;
     // A zero holds the place of the next group's length.
@@ -50,7 +50,7 @@ HOT static inline void out_byte(struct out *out, uint8_t byte)
         out->next = out->ring;
 }
 
-HOT uint16_t sg_wire_encode_ring(const struct sg_head *head, const void *body, uint8_t body_bytes, uint8_t *ring,
+uint16_t sg_wire_encode_ring(const struct sg_head *head, const void *body, uint8_t body_bytes, uint8_t *ring,
                              uint16_t size, uint16_t at)
 {
     struct out out = { .next = ring + at, .code = ring + at, .ring = ring, .end = ring + size, .group = 0 };
