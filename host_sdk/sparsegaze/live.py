@@ -57,6 +57,8 @@ class Tally:
             return "too much light"
         if flags & lib.SG_FLAG_STARVED:
             return "too little light"
+        if flags & lib.SG_FLAG_EXPOSURE:
+            return "exposures follow the light"
         return "blink, or a headset that moved"
 
     def report(self):

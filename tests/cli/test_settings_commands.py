@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """`settings`, `exposure`, `status`, `doctor PORT`: what is in force, what cannot be, what is wrong."""
 
+from types import SimpleNamespace
+
 import pytest
 from fake_device import linear_model
 
-from sparsegaze import faults
-from sparsegaze.wire import ALARM_NAMES, FAULT_NAMES, lib
+from sparsegaze import faults, live
+from sparsegaze.device import Frame
+from sparsegaze.wire import ALARM_NAMES, FAULT_NAMES, Gaze, lib
 
 
 def test_settings_shows_what_is_in_force_and_the_limit(command, command_json, fake):
@@ -281,3 +284,20 @@ def test_a_stream_without_one_valid_gaze_says_what_to_do(command, fake):
     assert "0.0 % valid" in out and "no gaze was valid" in out and "sparsegaze calibrate PORT" in out
     fake(linear_model())
     assert "no gaze was valid" not in command("stream", "PORT", "--seconds", "1")[1]
+
+
+@pytest.mark.parametrize(
+    "flags, words",
+    [
+        (lib.SG_FLAG_FAULT | lib.SG_FLAG_STARVED, "a fault: see sparsegaze status"),
+        (lib.SG_FLAG_SATURATED, "too much light"),
+        (lib.SG_FLAG_STARVED | lib.SG_FLAG_EXPOSURE, "too little light"),
+        (lib.SG_FLAG_EXPOSURE, "exposures follow the light"),
+        (lib.SG_FLAG_RECOVERING, "blink, or a headset that moved"),
+    ],
+)
+def test_the_line_of_a_stream_says_why_there_is_no_gaze(flags, words):
+    tally = live.Tally()
+    device = SimpleNamespace(lost=0, incomplete=0, bad=0, clock=SimpleNamespace(drift=0.0))
+    tally.add(Frame(1, 1000, 0.0, None, Gaze(1000, 0, 0, 700, flags, 40), None), device)
+    assert f"no valid gaze ({words})" in tally.text() and tally.valid == 0
