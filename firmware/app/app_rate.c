@@ -9,8 +9,8 @@
 enum app_rate_cost {
     COST_SENSE = 4250,          // interrupts of one sensing cycle; they send the gaze as well
     COST_FRAME = 3950,          // readings, features, exposure and health of one channel, the loop
-    COST_MODEL = 2150,          // inference: with any model, and per vector, with the interrupts of that time
-    COST_VECTOR = 210,
+    COST_MODEL = 2930,          // inference: with any model, and per vector
+    COST_VECTOR = 158,
     COST_RECENTRE = 640,        // a correction, if there is one
     COST_GAZE = 1030,           // its packet
     COST_RAW = 6500,            // and sending it
@@ -133,7 +133,7 @@ SELDOM void app_rate_start(struct hal_timing *timing)
     // What is left of the time until the next frame's first cycle is complete.
     const uint16_t spare = frame - times(period, repeats) + period - work_us();
     // The last sample takes a slot of 18 to arrive.
-    app.busy_us = period + (period >> 4) - 6 + COST_REQUEST / CYCLES_PER_US;
+    app.busy_us = period + (app.pause ? dark : 0) + (period >> 4) - 6 + COST_REQUEST / CYCLES_PER_US;
     app.infer_fits = !app.sensed || spare >= infer_us();
     app.roomy = !app.sensed || spare >= ROOMY_US;
 }

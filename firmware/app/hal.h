@@ -78,6 +78,8 @@ uint16_t hal_exposure_most(uint8_t channel);
 // Encode a packet (sg_wire_encode_ring: n + 8 bytes) into the send queue if at least keep_free bytes of the
 // queue stay free after it. n <= SG_WIRE_BODY_MAX. Returns 1, or 0 if not queued.
 uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_t keep_free);
+// Bytes of the queue that are free.
+uint8_t hal_room(void);
 
 // Once everything queued has left: change the line speed, or reset through the watchdog (slow writes are
 // finished first). Until then hal_send() refuses.
@@ -111,9 +113,7 @@ void hal_report(struct sg_status *status);
 // returns.
 void app_on_cycle(const struct hal_cycle *cycle);
 
-// One byte arrived; zero_us is when the latest 0x00 arrived. Called only while one whole reply
-// (SG_WIRE_FRAME_MAX) fits into the send queue: what is not delivered waits, so a request is never dropped
-// for want of room for its answer.
+// One byte arrived; zero_us is when the latest 0x00 arrived.
 void app_on_byte(uint8_t byte, uint32_t zero_us);
 // Is there time for this byte, and for some more if it is not 0x00? While this is 0 it waits.
 uint8_t app_listens(uint8_t byte);

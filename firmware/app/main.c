@@ -17,9 +17,10 @@ enum {
     // sunlight beside little of ours makes of a gaze; its neighbours are no better, whatever they say.
     JUMP_DEG_Q1 = 3,                    // a degree in 1024 us is one in 512 us
     CALM_256US = 32,
-    BYTES_US = 130,                     // a look at the line
-    REQUEST_US = 188,                   // a request, and its answer
-    // One that makes a frame late is heard after so many cycles, if no frame is late yet: it takes 500 us, a long
+    BYTES_US = 185,                     // a look at the line
+    DECODE_US = 90,                     // a packet
+    REQUEST_US = 150,                   // a request, and its answer
+    // One that makes a frame late is done after so many cycles, if no frame is late yet: it takes 500 us, a long
     // one and receiving the next 2 us a byte more, and readings are lost when work is behind by a whole period.
     PATIENCE_CYCLES = 6,
     PATIENCE_MOST_CYCLES = 40,          // whatever happens
@@ -40,8 +41,16 @@ static uint16_t frame_seq;
 static uint8_t left;                    // cycles still to come
 static uint8_t under_way;
 static uint16_t last_us;                // of the last sample
-static uint8_t refused;                 // a request came and found no time
+static uint8_t refused;                 // something came on the line and found no time
 static uint8_t waited;                  // cycles that it has waited
+
+// A request, until there is time for it; its body is still where it was decoded.
+static struct {
+    struct sg_head head;
+    uint32_t zero_us;
+    uint8_t bytes;
+    uint8_t waiting;
+} heard;
 
 static uint16_t previous_exposure[HAL_CHANNELS];
 // A frame is never 65 ms: bytes tell times apart.
@@ -96,29 +105,56 @@ uint8_t app_time_for(uint8_t us)
     return app.roomy || (uint16_t)(hal_now_us16() - last_us) + us < app.busy_us;
 }
 
-uint8_t app_listens(uint8_t byte)
+// The same for what comes on the line, whose patience ends.
+static uint8_t time_for_line(uint8_t us)
 {
-    if (asked.waiting)
-        return 0;
-    if (app_time_for(byte || !app.link.fill ? BYTES_US : REQUEST_US)
+    if (app_time_for(us)
         || (waited > PATIENCE_CYCLES
-            && (waited > PATIENCE_MOST_CYCLES || app_time_for((uint8_t)(app.link.fill << 1)))))
+            && (waited > PATIENCE_MOST_CYCLES || app_time_for((uint8_t)(heard.bytes << 1)))))
         return 1;
     refused = 1;
     return 0;
 }
 
+uint8_t app_listens(uint8_t byte)
+{
+    if (asked.waiting | heard.waiting)
+        return 0;
+    return time_for_line(byte ? BYTES_US : DECODE_US);
+}
+
+NOT_KEPT static void answer(void)
+{
+    if (!heard.waiting)
+        return;
+    // With room for an answer and for as much of the streams, so that none of them is left out for it, unless the
+    // line never has that.
+    if (hal_room() < (waited > PATIENCE_CYCLES ? 1 : 2) * SG_WIRE_FRAME_MAX) {
+        refused = 1;
+        return;
+    }
+    if (!time_for_line(REQUEST_US))
+        return;
+    heard.waiting = waited = 0;
+    memcpy(app_body.bytes, app.link.frame + SG_WIRE_HEAD_BYTES, sizeof app_body.bytes);
+    app_request(&heard.head, heard.bytes, heard.zero_us);
+}
+
 void app_on_byte(uint8_t byte, uint32_t zero_us)
 {
-    struct sg_head head;
     if (byte != 0) {
         sg_link_put(&app.link, byte);
         return;
     }
-    waited = 0;
-    const int n = sg_link_end(&app.link, &head, app_body.bytes);
-    if (n >= 0)
-        app_request(&head, (uint8_t)n, zero_us);
+    const int n = sg_link_end(&app.link, &heard.head, app.link.frame + SG_WIRE_HEAD_BYTES);
+    if (n < 0) {
+        waited = 0;
+        return;
+    }
+    heard.zero_us = zero_us;
+    heard.bytes = (uint8_t)n;
+    heard.waiting = 1;
+    answer();
 }
 
 static uint8_t acquires(void)
@@ -324,6 +360,7 @@ int main(void)
 {
     start();
     while (hal_poll()) {
+        answer();
         if (app.infer_fits || (asked.waiting && app_time_for(0)))
             long_work();
         app_sense_step();

@@ -33,7 +33,8 @@ int sg_link_feed(struct sg_link_rx *rx, const uint8_t *data, size_t n, size_t *u
                  void *body);
 // cdef end
 
-// The same in two: any byte but a delimiter, and a delimiter that ends the frame so far, of one byte at least.
+// The same in two: any byte but a delimiter, and a delimiter. The body may stay where it is decoded, in the frame behind
+// the head, until the next byte comes.
 void sg_link_put(struct sg_link_rx *rx, uint8_t byte);
 int sg_link_end(struct sg_link_rx *rx, struct sg_head *head, void *body);
 

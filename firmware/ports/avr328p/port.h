@@ -54,7 +54,6 @@ void sense_report(struct sg_status *status);
 
 // serial.c
 void serial_start(void);
-uint8_t serial_room(void);              // bytes free in the send queue
 uint8_t serial_poll(void);              // delivers received bytes; acts once the line has drained
 uint8_t serial_idle(void);              // nothing to deliver and nothing to do once the line has drained
 uint16_t serial_overruns(void);

@@ -59,8 +59,9 @@ static uint16_t exposure[HAL_CHANNELS];     // asked for, clipped
 static uint16_t slot;                       // of `timing`
 static __uint24 pause_new;
 static uint8_t timing_new, plan_new;        // asked for and not in a plan yet
-static uint8_t plan_urgent;             // an exposure halves or doubles: the light is another, nothing waits for turns
-static uint8_t plan_whole = 1;          // no list of it is that of the plan in use
+static uint8_t plan_hurry;              // bits of enum hurry: all lists at once, nothing waits for time
+// An exposure halves or doubles: the light is another. No list is that of the plan in use.
+enum hurry { HURRY_LIGHT = 1, HURRY_WHOLE = 2 };
 static uint8_t plan_waited;             // turns, for time to write a list
 static uint8_t written;                     // lists of the next plan
 static uint8_t locked_out;
@@ -281,7 +282,7 @@ void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS])
     plan_clip(exposure_cycles, timing.wiring, slot);
     for (uint8_t i = 0; i < HAL_CHANNELS; i++)
         if (exposure_cycles[i] < exposure[i] >> 1 || exposure_cycles[i] >> 1 > exposure[i])
-            plan_urgent = 1;
+            plan_hurry |= HURRY_LIGHT;
     memcpy(exposure, exposure_cycles, sizeof exposure);
     plan_new = 1;
 }
@@ -317,7 +318,7 @@ SELDOM void hal_set_timing(struct hal_timing *t)
     plan_clip(exposure, t->wiring, n);
     timing_new = 1;
     plan_new = 1;
-    plan_whole = 1;
+    plan_hurry = HURRY_WHOLE;
     written = 0;
 }
 
@@ -334,7 +335,7 @@ SELDOM static uint8_t write_plan(void)
     }
     const struct plan *now_used = &sense_plan[plan_next];
     const uint8_t a = plan_channel(timing.wiring, 2 * written), b = plan_channel(timing.wiring, 2 * written + 1);
-    const uint8_t copied = !plan_whole && plan->exposure_cycles[a] == now_used->exposure_cycles[a]
+    const uint8_t copied = !(plan_hurry & HURRY_WHOLE) && plan->exposure_cycles[a] == now_used->exposure_cycles[a]
                            && plan->exposure_cycles[b] == now_used->exposure_cycles[b];
     if (copied)
         plan_copy(plan, now_used, written);
@@ -343,7 +344,7 @@ SELDOM static uint8_t write_plan(void)
     if (++written != 3)
         return copied;
     written = 0;
-    plan_urgent = plan_whole = 0;
+    plan_hurry = 0;
     if (shown_plan == index)
         shown_plan = NONE;
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
@@ -365,7 +366,8 @@ SELDOM static uint8_t write_plan(void)
 static uint8_t time_for_list(void)
 {
     const uint16_t since = ticks_now() - sense_base;
-    if (plan_urgent || ++plan_waited >= PLAN_PATIENCE || (sense_done == sense_took && since < (SLOTS - 1) * sense_slot)) {
+    if (plan_hurry || ++plan_waited >= PLAN_PATIENCE
+        || (sense_done == sense_took && since < (SLOTS - 1) * sense_slot)) {
         plan_waited = 0;
         return 1;
     }
@@ -377,13 +379,13 @@ void sense_poll(void)
     if (locked_out && sense_wraps >= LOCKOUT_WRAPS) {
         locked_out = 0;
         plan_new = 1;
-        plan_whole = 1;
+        plan_hurry = HURRY_WHOLE;
         written = 0;
     }
     // The other plan is free when neither the running cycle nor the newest complete one follows it.
     if ((plan_new || written) && sense_current == plan_next && filling()->other->plan == plan_next
         && time_for_list())
-        while ((write_plan() || plan_urgent) && written) {
+        while ((write_plan() || plan_hurry) && written) {
         }
     try_supply();
 }

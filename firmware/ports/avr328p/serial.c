@@ -161,7 +161,7 @@ void serial_start(void)
     UCSR0B = POLLED;
 }
 
-uint8_t serial_room(void)
+uint8_t hal_room(void)
 {
     const uint8_t tail = tx_tail, head = tx_head;
     return (tail > head ? tail : tail + TX_RING) - head - 1;
@@ -169,13 +169,13 @@ uint8_t serial_room(void)
 
 uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_t keep_free)
 {
-    if (after_pending || (uint16_t)n + AROUND_BODY + keep_free > serial_room())
+    if (after_pending || (uint16_t)n + AROUND_BODY + keep_free > hal_room())
         return 0;
     const uint8_t end = (uint8_t)sg_wire_encode_ring(head, body, n, tx_ring, TX_RING, tx_head);
     __asm__ volatile("" : : : "memory");      // the bytes are there before they are sent
     tx_head = end;
     const uint8_t polled = keep_free && n > LONG_BODY ? POLLED_LONG : POLLED_BYTES;
-    const uint8_t waiting = TX_RING - 1 - serial_room();
+    const uint8_t waiting = TX_RING - 1 - hal_room();
     if (waiting > polled + SENT_MEANWHILE) {
         // Not much more by the interrupt than this packet has: the polling works off an answer, bit by bit.
         uint8_t sent = waiting - polled;
@@ -249,14 +249,11 @@ uint8_t serial_poll(void)
     send_on();
     if (after_pending)
         carry_out();
-    const uint8_t waiting = (rx_head - rx_tail) & (RX_RING - 1);
-    if (!waiting || (waiting < RX_RING / 2 && !app_listens(1)))
+    if (rx_tail == rx_head)
         return 0;
     while (left-- && rx_tail != rx_head && !after_pending) {
         const uint8_t byte = rx_ring[rx_tail];
-        // Only a frame's end makes work, and asks for the time; when first looked at it is less than one turn of
-        // the timer ago. With room for an answer and for as much of the streams, so that none of them is left
-        // out for it.
+        // Only a frame's end asks for the time; when first looked at it is less than one turn of the timer ago.
         if (byte == 0) {
             if (!zero_seen) {
                 zero_seen = 1;
@@ -267,9 +264,11 @@ uint8_t serial_poll(void)
                 const uint32_t now_us = hal_now_us();
                 zero_us = now_us - ((uint16_t)((uint16_t)(now_us << 4) - zero) >> 4);
             }
-            if (!app_listens(0) || serial_room() < 2 * SG_WIRE_FRAME_MAX)
+            if (!app_listens(0))
                 break;
-            zero_seen = 0;
+            zero_seen = left = 0;       // what follows may have to wait for it
+        } else if (left == BYTES_PER_POLL - 1 && !app_listens(byte)) {
+            break;
         }
         rx_tail = (rx_tail + 1) & (RX_RING - 1);
         app_on_byte(byte, zero_us);

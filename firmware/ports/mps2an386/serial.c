@@ -17,9 +17,9 @@ static uint16_t used(void)
     return (uint8_t)(tx_head - tx_tail);
 }
 
-static uint16_t room(void)
+uint8_t hal_room(void)
 {
-    return TX_RING - 1 - used();
+    return (uint8_t)(TX_RING - 1 - used());
 }
 
 void serial_start(void)
@@ -34,7 +34,7 @@ void serial_start(void)
 
 uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_t keep_free)
 {
-    if (after_pending || room() < n + AROUND_BODY + keep_free)
+    if (after_pending || hal_room() < n + AROUND_BODY + keep_free)
         return 0;
     tx_head = (uint8_t)sg_wire_encode_ring(head, body, n, tx_ring, TX_RING, tx_head);
     return 1;
@@ -58,7 +58,7 @@ uint8_t serial_poll(void)
         if (after == HAL_AFTER_REBOOT)
             boot_restart();             // a change of speed changes nothing here: no bit takes any time
     }
-    for (uint8_t i = 0; i < BYTES_PER_POLL && app_listens(0) && room() >= SG_WIRE_FRAME_MAX; i++) {
+    for (uint8_t i = 0; i < BYTES_PER_POLL && app_listens(0); i++) {
         if (!(UART_STATE(UART_LINE) & UART_STATE_RX_FULL))
             break;
         const uint8_t byte = (uint8_t)UART_DATA(UART_LINE);
