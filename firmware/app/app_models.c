@@ -30,7 +30,7 @@ static uint8_t stored = SG_SLOT_NONE;           // what TRIAL_USE 0 goes back to
 static struct check check;
 static uint8_t trial[TRIAL ? HAL_TRIAL_BYTES : 1];
 
-static const uint8_t *slot_image(uint8_t slot)
+SELDOM static const uint8_t *slot_image(uint8_t slot)
 {
     return TRIAL && slot == SG_SLOT_RAM ? trial : hal_slot(slot);
 }

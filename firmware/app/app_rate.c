@@ -80,7 +80,7 @@ SELDOM static uint16_t work_us(void)
 }
 
 // n * by; at most 16 * 1998 and no frame's time more.
-static uint16_t times(uint16_t n, uint8_t by)
+SELDOM static uint16_t times(uint16_t n, uint8_t by)
 {
     return n * by;
 }
@@ -153,7 +153,7 @@ uint16_t app_frame_us(void)
     return (uint16_t)(timing->frame_cycles / CYCLES_PER_US);
 }
 
-SELDOM int8_t app_settings(struct sg_settings *io)
+SELDOM __attribute__((noclone)) int8_t app_settings(struct sg_settings *io)
 {
     if (io->op > SG_SETTINGS_SET)
         return SG_E_ARG;

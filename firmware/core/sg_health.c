@@ -23,7 +23,7 @@ void sg_health_start(struct sg_health *health)
 
 // Count a suspicion up, its absence down. Returns the fault to report: `suspected` once it has lasted,
 // `known` until it has been gone as long.
-static uint8_t debounced(uint8_t *count, uint8_t suspected, uint8_t known)
+static __attribute__((noinline)) uint8_t debounced(uint8_t *count, uint8_t suspected, uint8_t known)
 {
     if (suspected) {
         if (*count < SG_HEALTH_PATIENCE)

@@ -20,7 +20,7 @@ const uint8_t plan_place[2][HAL_CHANNELS] PROGMEM = {
 
 struct plan sense_plan[2];
 
-uint8_t plan_channel(uint8_t wiring, uint8_t place)
+__attribute__((noinline)) uint8_t plan_channel(uint8_t wiring, uint8_t place)
 {
     return pgm_read_byte(&plan_place[wiring != SG_WIRING_LEDS][place]);
 }

@@ -151,7 +151,7 @@ static struct taken *filling(void)
 
 // The first GND slot of the cycle that makes sense_done `of` converts the divider at A7 instead; the
 // interrupt sets it back when that is under way.
-static void ask_supply(struct plan *plan, uint8_t of)
+SELDOM static void ask_supply(struct plan *plan, uint8_t of)
 {
     if (supply != SUPPLY_WANTED)
         return;
