@@ -6,8 +6,8 @@
 #include <string.h>
 
 enum {
-    // Stream frames leave this much of the send queue to answers that were not waited with: all others have their
-    // room before the request is heard.
+    // Stream frames leave this much of the send queue to answers that come by themselves: all others have
+    // their room before the request is heard.
     REPLY_RESERVE = 24,
     // A blink leaves the calibrated range before the lids are where they were: this long after the last frame
     // out of range a gaze may look right and be wrong.
@@ -20,8 +20,8 @@ enum {
     BYTES_US = 185,                     // a look at the line
     DECODE_US = 90,                     // a packet
     REQUEST_US = 150,                   // a request, and its answer
-    // One that makes a frame late is done after so many cycles, if no frame is late yet: it takes 500 us, a long
-    // one and receiving the next 2 us a byte more, and readings are lost when work is behind by a whole period.
+    // One that makes a frame late is done after so many cycles, if no frame is late yet: it takes 500 us, a
+    // long one and receiving the next 2 us a byte more, and readings are lost when work is behind by a period.
     PATIENCE_CYCLES = 6,
     PATIENCE_MOST_CYCLES = 40,          // whatever happens
 };

@@ -323,9 +323,10 @@ def test_a_command_storm_at_full_frame_rate_loses_and_delays_nothing(worn):
                 (lib.SG_MSG_MODEL_READ, wire.body("struct sg_model_at", length=48))]
     decoder, seen, lost, sent = wire.Decoder(), [], [], 300
     decoder.feed(link.read(4096, 0.01))                     # it begins to listen in the middle of a frame
-    began_bad = decoder.bad
+    began_bad, arrived_us = decoder.bad, []
     for ticket in range(sent):
         kind, body = requests[ticket % len(requests)]
+        written_us = one.now_us()
         link.write(wire.encode(kind, ticket, body))
         answered, patience = False, link.now() + 0.05
         while not answered and link.now() < patience:
@@ -333,10 +334,15 @@ def test_a_command_storm_at_full_frame_rate_loses_and_delays_nothing(worn):
                 if packet.type == lib.SG_MSG_GAZE:
                     seen.append(packet.seq)
                 answered |= packet.type == kind | lib.SG_REPLY and packet.seq == ticket
+                if packet.type == lib.SG_MSG_PING | lib.SG_REPLY:
+                    arrived_us.append(wire.parse(wire.Pong, packet.body).rx_us - written_us)
         if not answered:
             lost.append((ticket, kind))
     counted, after = one.control.counters(), one.device.status()
     gaps = np.diff(np.array(seen)) % 65536
+    # However long it waited for its turn, a ping says when it came.
+    print(f"pings came {min(arrived_us)} .. {max(arrived_us)} us after they were sent, by the device's clock")
+    assert len(arrived_us) == sent / len(requests) and np.ptp(arrived_us) < 200
     # The receiver holds two bytes and one that comes: it has 328 cycles from a byte's end to lose none.
     print(f"a byte waited {counted['longest_rx_cycles']} cycles at most")
     assert counted["longest_rx_cycles"] <= 290

@@ -21,8 +21,8 @@ extern volatile uint8_t tx_head;                // written by the main loop
 extern volatile uint8_t tx_tail;                // written with interrupts off
 extern volatile uint16_t zero_ticks;            // TCNT1 when the latest 0x00 arrived
 
-// Subroutine of the assembler: keeps the byte that has arrived. With interrupts off; some 40 cycles. Uses r24,
-// r25, r30, r31 and the flags.
+// Subroutine of the assembler: keeps the byte that has arrived. With interrupts off; some 40 cycles. Uses
+// r24, r25, r30, r31 and the flags.
 void serial_byte(void);
 
 #endif

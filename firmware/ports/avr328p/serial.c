@@ -10,8 +10,8 @@
 enum {
     AROUND_BODY = SG_WIRE_FRAME_MAX - SG_WIRE_BODY_MAX,
     POLLED = (1 << RXCIE0) | (1 << RXEN0) | (1 << TXEN0),       // UCSR0B
-    // As many as wait are left to the polling: an answer and a gaze; after a long frame of a stream fewer, the
-    // next gaze would be late.
+    // As many as wait are left to the polling: an answer and a gaze; after a long frame of a stream fewer,
+    // the next gaze would be late.
     POLLED_BYTES = 96,
     POLLED_LONG = 24,
     LONG_BODY = 16,
@@ -35,12 +35,12 @@ static uint8_t after_pending;
 static uint8_t after;
 static uint16_t drained_ticks;
 static uint8_t drained;
-static uint32_t zero_us;                // when the 0x00 that waits arrived
-static uint8_t zero_seen;               // one does, and that is known
+static uint32_t zero_us;                // the same as device time
+static volatile uint8_t zero_new;       // not yet
 
-// Takes the byte and a place in the ring, then lets other interrupts in: a release waits for half of this, not
-// for all. What they receive comes behind it, and nobody looks at the ring before this has ended. In assembler
-// because the compiler's prologue would cost as much again.
+// Takes the byte and a place in the ring, then lets other interrupts in: a release waits for half of this,
+// not for all. What they receive comes behind it, and nobody looks at the ring before this has ended. In
+// assembler because the compiler's prologue would cost as much again.
 #define TAKE_BYTE                                                                                       \
     "lds r30, %[head]" "\n\t" "mov r24, r30" "\n\t" "inc r24" "\n\t" "andi r24, %[mask]" "\n\t"         \
     "lds r25, %[tail]" "\n\t" "cpse r24, r25" "\n\t" "sts %[head], r24" "\n\t"                        \
@@ -92,6 +92,7 @@ ISR(USART_RX_vect, ISR_NAKED)
                      "lds r25, %[ticks]+1" "\n\t"
                      "sts %[zero]+1, r25" "\n\t"
                      "sts %[zero], r24" "\n\t"
+                     "sts %[new], r31" "\n\t"        // not 0, by the flag of the comparison
                      "out __SREG__, r31" "\n"
                      "4:" "\t" "ret" "\n"
                      "3:" "\t"
@@ -106,7 +107,8 @@ ISR(USART_RX_vect, ISR_NAKED)
                      [mark] "I"(_SFR_IO_ADDR(GPIOR0)), [status] "i"(_SFR_MEM_ADDR(UCSR0A)),
                      [data] "i"(_SFR_MEM_ADDR(UDR0)), [overrun] "i"(DOR0), [overruns] "i"(&rx_overruns),
                      [head] "i"(&rx_head), [tail] "i"(&rx_tail), [mask] "i"(RX_RING - 1),
-                     [ring] "i"(rx_ring), [ticks] "i"(_SFR_MEM_ADDR(TCNT1L)), [zero] "i"(&zero_ticks)
+                     [ring] "i"(rx_ring), [ticks] "i"(_SFR_MEM_ADDR(TCNT1L)), [zero] "i"(&zero_ticks),
+                     [new] "i"(&zero_new)
                      : "memory");
 }
 
@@ -249,24 +251,23 @@ uint8_t serial_poll(void)
     send_on();
     if (after_pending)
         carry_out();
+    if (zero_new) {                     // at once: in 4 ms the timer comes round
+        zero_new = 0;
+        uint16_t zero;
+        ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+            zero = zero_ticks;
+        }
+        const uint32_t now_us = hal_now_us();
+        zero_us = now_us - ((uint16_t)((uint16_t)(now_us << 4) - zero) >> 4);
+    }
     if (rx_tail == rx_head)
         return 0;
     while (left-- && rx_tail != rx_head && !after_pending) {
         const uint8_t byte = rx_ring[rx_tail];
-        // Only a frame's end asks for the time; when first looked at it is less than one turn of the timer ago.
         if (byte == 0) {
-            if (!zero_seen) {
-                zero_seen = 1;
-                uint16_t zero;
-                ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
-                    zero = zero_ticks;
-                }
-                const uint32_t now_us = hal_now_us();
-                zero_us = now_us - ((uint16_t)((uint16_t)(now_us << 4) - zero) >> 4);
-            }
             if (!app_listens(0))
                 break;
-            zero_seen = left = 0;       // what follows may have to wait for it
+            left = 0;                   // what follows may have to wait for it
         } else if (left == BYTES_PER_POLL - 1 && !app_listens(byte)) {
             break;
         }
