@@ -61,10 +61,11 @@ ONCE static uint16_t within(const struct sg_expose_led *led, uint16_t cycles)
 // 64 * SG_EXPOSE_GOAL_CODES / load, rounded down; a load of 8 codes or more.
 static uint16_t stretch_q6(uint16_t load)
 {
-    uint16_t rest = 0, quotient = (uint16_t)(SG_EXPOSE_GOAL_CODES << 6);
+    // The first three bits are 0.
+    uint16_t rest = SG_EXPOSE_GOAL_CODES * 64U >> 13, quotient = (uint16_t)(SG_EXPOSE_GOAL_CODES * 512UL);
     if (load < 8)
         load = 8;
-    for (uint8_t bit = 0; bit < 16; bit++) {
+    for (uint8_t bit = 0; bit < 13; bit++) {
         rest = (uint16_t)((uint16_t)(rest << 1) | (quotient >> 15));
         quotient = (uint16_t)(quotient << 1);
         if (rest >= load) {

@@ -212,14 +212,14 @@ def test_what_dims_by_far_is_followed_after_longer_than_a_blink_and_what_dims_by
     assert meets_goal(sensors) and sensors.changes.max() == settled.max() + 1
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_exposures_rest_while_eyes_look_about_and_blink(seed):
     """Gaze moves each sensor's light by up to 4.4 from end to end, shut lids bring up to 3 times the middle."""
     rng = np.random.default_rng(seed)
     sensors, middle = Sensors(seed=seed), NOMINAL_NA * rng.uniform(0.4, 3, 6)
     reach, lids = rng.uniform(0.3, 0.74, 6), rng.uniform(1.2, 3, 6)
     full, changes, saturated = [], [], 0
-    for second in range(40):
+    for _ in range(30):
         before = sensors.changes.sum()
         for _ in range(2):
             blink = rng.random() < 0.125            # 15 a minute
@@ -230,7 +230,7 @@ def test_exposures_rest_while_eyes_look_about_and_blink(seed):
         full.append(saturated)
         changes.append(sensors.changes.sum() - before)
     print(f"changes of each second {changes}, full cycles until then {full}")
-    assert sum(changes[1:]) <= 10 and sum(changes[20:]) <= 2
+    assert sum(changes[1:]) <= 10 and sum(changes[15:]) <= 2
     assert full[-1] - full[0] <= 12
     assert (own(sensors.lit) - own(sensors.unlit)).min() > 40   # nobody starves for it
 
