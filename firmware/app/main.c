@@ -17,9 +17,9 @@ enum {
     // sunlight beside little of ours makes of a gaze; its neighbours are no better, whatever they say.
     JUMP_DEG_Q1 = 3,                    // a degree in 1024 us is one in 512 us
     CALM_256US = 32,
-    BYTES_US = 185,                     // a look at the line
+    BYTES_US = 130,                     // a look at the line
     DECODE_US = 90,                     // a packet
-    REQUEST_US = 150,                   // a request, and its answer
+    REQUEST_US = 130,                   // a request, and its answer
     // One that makes a frame late is done after so many cycles, if no frame is late yet: it takes 500 us, a
     // long one and receiving the next 2 us a byte more, and readings are lost when work is behind by a period.
     PATIENCE_CYCLES = 6,
