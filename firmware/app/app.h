@@ -35,6 +35,8 @@ struct app_state {
     uint16_t feature[HAL_CHANNELS];     // of the last frame
     uint16_t slot_bytes;
     uint8_t stream;                     // bits of enum sg_stream
+    uint8_t stream_kept;                // those that are sent while the timing of `stream` is not in force yet,
+    uint8_t settling;                   // for so many cycles
     uint8_t exposure_auto;              // stored when exposures are
     uint8_t slow_line;                  // 500 kbaud
     uint8_t probe;                      // the only emitter, or APP_NO_PROBE

@@ -6,7 +6,7 @@
 #include <stddef.h>
 #include <string.h>
 
-enum { REBOOT_KEY = 0xA5, STREAM_ALL = SG_STREAM_RAW | SG_STREAM_GAZE | SG_STREAM_COUNTS };
+enum { REBOOT_KEY = 0xA5, SETTLING_CYCLES = 4, STREAM_ALL = SG_STREAM_RAW | SG_STREAM_GAZE | SG_STREAM_COUNTS };
 
 union app_body app_body;
 
@@ -158,6 +158,8 @@ SELDOM void app_request(const struct sg_head *head, uint8_t n, uint32_t arrived_
         if (app_body.mode.mode & ~STREAM_ALL)
             result = SG_E_ARG;
         else if (app.stream != app_body.mode.mode) {
+            app.stream_kept = app.stream & app_body.mode.mode;
+            app.settling = SETTLING_CYCLES;
             app.stream = app_body.mode.mode;
             app_rate_renew();
         }

@@ -267,18 +267,19 @@ static void finish_frame(const struct hal_cycle *cycle)
     }
 
     HAL_BEGIN(HAL_SECTION_OUTPUT);
-    if (app.stream & SG_STREAM_GAZE) {
+    const uint8_t stream = app.settling ? app.stream_kept : app.stream;
+    if (stream & SG_STREAM_GAZE) {
         out->gaze.t_us = t_us;
         out->gaze.infer_us = hal_now_us16() - (uint16_t)t_us - span_us;
         send_stream(SG_MSG_GAZE, &out->gaze, sizeof out->gaze);
     }
-    if (app.stream & SG_STREAM_RAW) {
+    if (stream & SG_STREAM_RAW) {
         out->raw.t_us = t_us;
         out->raw.span_us = span_us;
         out->raw.flags = flags;
         send_raw(&out->raw, model, recentre);
     }
-    if (app.stream & SG_STREAM_COUNTS)
+    if (stream & SG_STREAM_COUNTS)
         send_counts(&out->counts, &cycle->reading, t_us);
     HAL_END(HAL_SECTION_OUTPUT);
 }
@@ -323,6 +324,7 @@ void app_on_cycle(const struct hal_cycle *cycle)
             app_count(&app.status.tx_dropped);
         app_sense_cycle(cycle);
     }
+    app.settling -= app.settling != 0;
     app_live_cycle(cycle->t_us);
     last_us = (uint16_t)cycle->t_us + cycle->span_us;
     if (refused && waited != UINT8_MAX)
