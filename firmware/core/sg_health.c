@@ -62,7 +62,7 @@ static uint8_t electrical(struct sg_health *health, uint8_t i, const struct sg_h
         && sight->exposure_cycles <= SG_HEALTH_SHORT_CYCLES)
         return SG_HEALTH_SHORT;
     if (sight->lit_code <= SG_HEALTH_NOTHING_CODE && sight->unlit_code <= SG_HEALTH_NOTHING_CODE
-        && sight->exposure_cycles >= sight->most_cycles - (sight->most_cycles >> 3))
+        && sight->exposure_cycles >= sight->most_cycles >> 1)
         return SG_HEALTH_OPEN;
     return mirrors(health, i, sight) ? SG_HEALTH_OPEN : 0;
 }

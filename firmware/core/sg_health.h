@@ -11,7 +11,7 @@
 // cdef begin
 // The values are those of enum sg_fault (sg_wire.h), which this module does not include.
 enum sg_health_fault {
-    SG_HEALTH_OPEN = 1,         // no current at all, lit or not, at the longest exposure
+    SG_HEALTH_OPEN = 1,         // no current at all, lit or not, at half the longest exposure or more
     SG_HEALTH_SHORT = 2,        // full at the shortest exposure, lit or not
     SG_HEALTH_LOW = 4,          // an octave or more below the calibrated range
     SG_HEALTH_HIGH = 8,         // one and a half octaves or more above its middle
