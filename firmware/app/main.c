@@ -305,7 +305,8 @@ static void take(const struct hal_cycle *cycle)
 
 void app_on_cycle(const struct hal_cycle *cycle)
 {
-    if (!app.sensed) {                  // what follows has to share the time with frames
+    const uint8_t first = !app.sensed;
+    if (first) {                        // what follows has to share the time with frames
         app.sensed = 1;
         app_rate_renew();
     }
@@ -322,7 +323,8 @@ void app_on_cycle(const struct hal_cycle *cycle)
             finish_frame(cycle);
         else if (last && app.stream)
             app_count(&app.status.tx_dropped);
-        app_sense_cycle(cycle);
+        if (!first)                     // which has enough to do
+            app_sense_cycle(cycle);
     }
     app.settling -= app.settling != 0;
     app_live_cycle(cycle->t_us);
