@@ -9,8 +9,8 @@
 enum app_rate_cost {
     COST_SENSE = 4250,          // interrupts of one sensing cycle; they send the gaze as well
     COST_FRAME = 3950,          // readings, features, exposure and health of one channel, the loop
-    COST_MODEL = 2930,          // inference: with any model, and per vector
-    COST_VECTOR = 158,
+    COST_MODEL = 2780,          // inference: with any model, and per vector
+    COST_VECTOR = 168,
     COST_RECENTRE = 640,        // a correction, if there is one
     COST_GAZE = 1030,           // its packet
     COST_RAW = 6500,            // and sending it
