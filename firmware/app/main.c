@@ -23,7 +23,7 @@ enum {
     // One that makes a frame late is done after so many cycles, if no frame is late yet: it takes 500 us, a
     // long one and receiving the next 2 us a byte more, and readings are lost when work is behind by a period.
     PATIENCE_CYCLES = 6,
-    PATIENCE_MOST_CYCLES = 40,          // whatever happens
+    PATIENCE_MOST_CYCLES = 80,          // whatever happens
 };
 
 struct app_state app;
