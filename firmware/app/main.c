@@ -13,6 +13,7 @@ enum {
     // out of range a gaze may look right and be wrong.
     RECOVERY_256US = 122,
     BLINK_256US = 43,                   // out of range for so long
+    DOUBT_256US = 9,                    // after each: lids that close are in range and out of it by turns
     // No eye turns by more than a degree in a millisecond. What moves by that and so much more is noise, such as
     // sunlight beside little of ours makes of a gaze; its neighbours are no better, whatever they say.
     JUMP_DEG_Q1 = 3,                    // a degree in 1024 us is one in 512 us
@@ -247,12 +248,14 @@ static void finish_frame(const struct hal_cycle *cycle)
     HAL_BEGIN(HAL_SECTION_INFER);
     sg_track_infer(model, app.feature, flags, recentre, &out->gaze);
     HAL_END(HAL_SECTION_INFER);
-    // Lids stay away for long; noise does not, nor does light that has just changed. Where an exposure follows it,
-    // features say nothing about the lids.
+    // Lids stay away for long; noise does not, nor does light that has just changed. Where an exposure follows
+    // it, features say nothing about the lids.
     if (!(out->gaze.flags & SG_FLAG_OUT_OF_RANGE) || odd || (flags & (SG_FLAG_SATURATED | SG_FLAG_STARVED))) {
         out_256us = 0;
     } else {
         out_256us = (uint8_t)(out_256us + since);
+        if (hold_256us < DOUBT_256US)
+            hold_256us = DOUBT_256US;
         if (out_256us >= BLINK_256US) {
             hold_256us = RECOVERY_256US;
             out_256us = BLINK_256US;

@@ -76,7 +76,7 @@ static uint16_t stretch_q6(uint16_t load)
     return quotient;
 }
 
-// Exposure that would have met the goal with this much unlit and this much of ours, collected in `then_cycles`.
+// Exposure that would have met the goal with this much unlit and this much of ours, collected in then_cycles.
 static uint16_t wanted(const struct sg_expose_led *led, uint16_t then_cycles, uint16_t unlit, uint16_t signal)
 {
     const uint16_t stretch = stretch_q6((uint16_t)(unlit + 2U * signal));
@@ -213,7 +213,7 @@ static void watch_ambient(struct sg_expose *expose, const struct sg_expose_led *
     }
 }
 
-// The channel sampled right before, whose code the sample capacitor brings along (see sg_light.h); itself: none.
+// The channel sampled right before, whose code the sample capacitor brings along (sg_light.h); itself: none.
 static uint8_t before(uint8_t i, uint8_t wiring)
 {
     if (wiring)
@@ -274,8 +274,8 @@ static inline uint8_t raised(uint16_t code)
 uint8_t sg_expose_cycle(struct sg_expose *expose, const struct sg_reading *reading, uint8_t wiring)
 {
     const uint16_t *code = reading->lit_code;
-    const uint8_t any = raised(code[0]) | raised(code[1]) | raised(code[2]) | raised(code[3]) | raised(code[4])
-                      | raised(code[5]);
+    const uint8_t any = raised(code[0]) | raised(code[1]) | raised(code[2])
+                      | raised(code[3]) | raised(code[4]) | raised(code[5]);
     if (expose->next == 0) {
         expose->next = CHANNELS;
         count_round(expose);

@@ -4,8 +4,8 @@
 // The goal: unlit + 2 * (lit - unlit) = 0.9 of full scale. Our own light varies: gaze moves it by a factor of
 // 4.4 from end to end at some sensors, shut lids throw back up to 3 times as much. So exposures follow its
 // peaks: they are shortened when a code is (nearly) full, by no more than that takes, and lengthened when the
-// brightest of seconds would have fitted twice. Within a few blinks they rest. What ambient light adds is seen
-// in the unlit code, so a change of it is acted on at once. Where the goal needs more than the longest
+// brightest of seconds would have fitted twice. Within a few blinks they rest. What ambient light adds is
+// seen in the unlit code, so a change of it is acted on at once. Where the goal needs more than the longest
 // exposure, that is taken: the usual state in the dark.
 #ifndef SG_EXPOSE_H
 #define SG_EXPOSE_H
@@ -76,10 +76,10 @@ void sg_expose_start(struct sg_expose *expose, const uint16_t exposure_cycles[6]
 // (what is taken instead is then the least). Call after every change.
 void sg_expose_taken(struct sg_expose *expose, const uint16_t exposure_cycles[6]);
 
-// One cycle: a look at the next channel; at once at those that are full (our light alone: half of the exposure;
-// else an eighth, or a sixteenth if the unlit code is full too) and at all that are being acquired: after the
-// start, after being full, and when ambient light fell away. A channel taken with another exposure than the one in
-// force says nothing: a pipeline of any depth does not correct twice.
+// One cycle: a look at the next channel; at once at those that are full (our light alone: half of the
+// exposure; else an eighth, or a sixteenth if the unlit code is full too) and at all that are being acquired:
+// after the start, after being full, and when ambient light fell away. A channel taken with another exposure
+// than the one in force says nothing: a pipeline of any depth does not correct twice.
 //   wiring     enum sg_wiring
 // Returns 1 if any led[].exposure_cycles changed, else 0.
 uint8_t sg_expose_cycle(struct sg_expose *expose, const struct sg_reading *reading, uint8_t wiring);

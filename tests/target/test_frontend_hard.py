@@ -142,12 +142,12 @@ def test_one_led_ten_times_brighter_than_the_rest_has_its_own_exposure(worn, tmp
     assert lit.max() < 1000 and lit[brighter] > 200 and lit.min() > 20
 
 
-@pytest.mark.parametrize("repeats, least, times", [(4, (0.98, 0.98), 1.1), (1, (0.4, 0.95), 1.2)])
+@pytest.mark.parametrize("repeats, least, times", [(4, (0.9, 0.95), 1.15), (1, (0.1, 0.9), 1.2)])
 def test_a_step_of_a_thousand_in_the_middle_of_an_exposure(worn, repeats, least, times):
     """12 up, 12 down at cycles that no exposure knows: few saturated frames, then the new level's error.
 
-    least   share of valid frames, in 2 uA and in 2 nA. At a cycle a frame the sunlight's noise is 1 deg RMS: what
-            moves by it faster than an eye is not called a gaze.
+    least   share of valid frames, in 2 uA and in 2 nA. At a cycle a frame the sunlight's noise is 1 deg RMS:
+            what moves by it faster than an eye is not called a gaze.
     """
     one = worn()
     one.device.settings(repeats=repeats)
@@ -169,8 +169,8 @@ def test_a_step_of_a_thousand_in_the_middle_of_an_exposure(worn, repeats, least,
     for name, level, share in (("up", high, least[0]), ("down", low, least[1])):
         after = [moments - step for step, na in steps if na == level]
         most = max(saturated[(since >= 0) & (since < gap_us - 5000)].sum() for since in after)
-        soon = np.concatenate([error[(since >= 10.5 * frame_us) & (since < 30 * frame_us)] for since in after])
-        later = np.concatenate([error[(since >= 40 * frame_us) & (since < gap_us - 5000)] for since in after])
+        soon, later = (np.concatenate([error[(since >= begin) & (since < end)] for since in after])
+                       for begin, end in ((10.5 * frame_us, 30 * frame_us), (40 * frame_us, gap_us - 5000)))
         shares = np.isfinite(soon).mean(), np.isfinite(later).mean()
         means = [np.nanmean(part) if np.isfinite(part).any() else np.inf for part in (soon, later)]
         print(f"{name}: at most {most} saturated; after 10 frames, after 40: {means} deg, valid {shares}")

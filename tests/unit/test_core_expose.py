@@ -60,10 +60,11 @@ class Sensors:
         self.lit = codes(np.asarray(signal_na) + ambient, self.exposure - late)
         self.unlit = codes(later, self.exposure)
         before = self.asked()
-        changed = look(self.state, self.lit.tolist(), self.unlit.tolist(), self.exposure.tolist(), late.tolist())
+        changed = look(self.state, self.lit, self.unlit, self.exposure, late.tolist())
         if self.nudge and changed:          # the port moves what it was asked for by a few per cent
             now = self.asked()
-            lib.sg_expose_taken(self.state, np.clip(now + self.nudge * (now != before), MIN, self.most).tolist())
+            nudged = np.clip(now + self.nudge * (now != before), MIN, self.most)
+            lib.sg_expose_taken(self.state, nudged.tolist())
         assert changed == (self.asked() != before).any() or self.nudge
         assert ((self.asked() >= MIN) & (self.asked() <= self.most)).all()
         self.changes += self.asked() != before
@@ -214,7 +215,7 @@ def test_what_dims_by_far_is_followed_after_longer_than_a_blink_and_what_dims_by
 
 @pytest.mark.parametrize("seed", range(3))
 def test_exposures_rest_while_eyes_look_about_and_blink(seed):
-    """Gaze moves each sensor's light by up to 4.4 from end to end, shut lids bring up to 3 times the middle."""
+    """Gaze moves a sensor's light by up to 4.4 from end to end, shut lids bring up to 3 times the middle."""
     rng = np.random.default_rng(seed)
     sensors, middle = Sensors(seed=seed), NOMINAL_NA * rng.uniform(0.4, 3, 6)
     reach, lids = rng.uniform(0.3, 0.74, 6), rng.uniform(1.2, 3, 6)
