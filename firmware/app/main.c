@@ -18,6 +18,7 @@ enum {
     // sunlight beside little of ours makes of a gaze; its neighbours are no better, whatever they say.
     JUMP_DEG_Q1 = 3,                    // a degree in 1024 us is one in 512 us
     CALM_256US = 32,
+    FRESH_256US = 20,                   // the next frame of four cycles
     BYTES_US = 130,                     // a look at the line
     DECODE_US = 90,                     // a packet
     REQUEST_US = 130,                   // a request, and its answer
@@ -244,6 +245,9 @@ static void finish_frame(const struct hal_cycle *cycle)
         flags |= SG_FLAG_RECOVERING;
         odd = 1;
     }
+    // What one code said of the ambient light outlasts the frame.
+    if (odd && app_timing()->repeats > 1 && hold_256us < FRESH_256US)
+        hold_256us = FRESH_256US;
 
     HAL_BEGIN(HAL_SECTION_INFER);
     sg_track_infer(model, app.feature, flags, recentre, &out->gaze);
