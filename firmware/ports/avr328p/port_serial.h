@@ -9,6 +9,7 @@
 
 enum {
     RX_RING = 128,                              // power of two
+    SERIAL_OWN = 1 << TXB80,                    // in UCSR0B, a ninth bit unused: the interrupt alone sends
     TX_RING = 252,                              // frames of all three streams (108), and two answers (72)
 };
 

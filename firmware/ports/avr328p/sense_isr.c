@@ -191,7 +191,7 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
           [flags] "I"(_SFR_IO_ADDR(TIFR1)), [match] "i"(_SFR_MEM_ADDR(OCR1AL)), [cycles] "M"(EVENT_CYCLES),
           [now] "i"(_SFR_MEM_ADDR(TCNT1L)), [tail] "i"(&tx_tail), [head] "i"(&tx_head), [ring] "i"(tx_ring),
           [size] "M"(TX_RING), [state] "i"(_SFR_MEM_ADDR(UCSR0A)), [control] "i"(_SFR_MEM_ADDR(UCSR0B)),
-          [itself] "I"(UDRIE0), [room] "I"(UDRE0), [came] "I"(RXC0),
+          [itself] "I"(TXB80), [room] "I"(UDRE0), [came] "I"(RXC0),
           [data] "i"(_SFR_MEM_ADDR(UDR0)), [end] "M"(2 * HAL_SECTION_SENSE + 2),
           [mark] "I"(_SFR_IO_ADDR(GPIOR0)));
     __asm__ volatile(

@@ -10,6 +10,7 @@
 enum {
     AROUND_BODY = SG_WIRE_FRAME_MAX - SG_WIRE_BODY_MAX,
     POLLED = (1 << RXCIE0) | (1 << RXEN0) | (1 << TXEN0),       // UCSR0B
+    OWN = SERIAL_OWN,
     // As many as wait are left to the polling: an answer and a gaze; after a long frame of a stream fewer,
     // the next gaze would be late.
     POLLED_BYTES = 96,
@@ -112,10 +113,14 @@ ISR(USART_RX_vect, ISR_NAKED)
                      : "memory");
 }
 
-// Sends up to tx_mark, then leaves the rest to the polling. In assembler for the same reason.
+// Sends up to tx_until, then leaves the rest to the polling. After 14 cycles it is off and others may come, so
+// that no release waits; OWN keeps the polling away meanwhile. In assembler for the same reason.
 ISR(USART_UDRE_vect, ISR_NAKED)
 {
     __asm__ volatile("push r24" "\n\t"
+                     "ldi r24, %[off]" "\n\t"
+                     "sts %[control], r24" "\n\t"
+                     "sei" "\n\t"
                      "in r24, __SREG__" "\n\t"
                      "push r24" "\n\t"
                      "push r30" "\n\t"
@@ -135,12 +140,13 @@ ISR(USART_UDRE_vect, ISR_NAKED)
                      "ldi r24, 0" "\n"
                      "1:" "\t" "sts %[tail], r24" "\n\t"
                      "lds r30, %[until]" "\n\t"
+                     "ldi r31, %[polled]" "\n\t"
                      "cpse r24, r30" "\n\t"
-                     "rjmp 2f" "\n\t"
-                     "ldi r24, %[polled]" "\n\t"
-                     "sts %[control], r24" "\n"
-                     "2:" "\t" "ldi r24, %[end]" "\n\t"
+                     "ldi r31, %[on]" "\n\t"
+                     "ldi r24, %[end]" "\n\t"
                      "out %[mark], r24" "\n\t"
+                     "cli" "\n\t"
+                     "sts %[control], r31" "\n\t"
                      "pop r31" "\n\t"
                      "pop r30" "\n\t"
                      "pop r24" "\n\t"
@@ -150,7 +156,8 @@ ISR(USART_UDRE_vect, ISR_NAKED)
                      : : [begin] "M"(2 * HAL_SECTION_SERIAL + 1), [end] "M"(2 * HAL_SECTION_SERIAL + 2),
                      [mark] "I"(_SFR_IO_ADDR(GPIOR0)), [tail] "i"(&tx_tail), [until] "i"(&tx_until),
                      [ring] "i"(tx_ring), [data] "i"(_SFR_MEM_ADDR(UDR0)), [size] "M"(TX_RING),
-                     [control] "i"(_SFR_MEM_ADDR(UCSR0B)), [polled] "M"(POLLED)
+                     [control] "i"(_SFR_MEM_ADDR(UCSR0B)), [polled] "M"(POLLED),
+                     [off] "M"(POLLED | OWN), [on] "M"(POLLED | OWN | 1 << UDRIE0)
                      : "memory");
 }
 
@@ -187,7 +194,7 @@ uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_
             sent = waiting - POLLED_BYTES;
         ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
             const uint8_t tail = tx_tail;
-            UCSR0B = POLLED | (1 << UDRIE0);
+            UCSR0B = POLLED | OWN | 1 << UDRIE0;
             tx_until = tail >= TX_RING - sent ? tail - (TX_RING - sent) : tail + sent;
         }
     }
@@ -234,7 +241,7 @@ static void carry_out(void)
 static void send_on(void)
 {
     const uint8_t tail = tx_tail;
-    if (tail == tx_head || (UCSR0B & (1 << UDRIE0)))
+    if (tail == tx_head || (UCSR0B & OWN))
         return;
     const uint8_t byte = tx_ring[tail], next = tail + 1 == TX_RING ? 0 : tail + 1;
     ATOMIC_BLOCK(ATOMIC_FORCEON) {
