@@ -4,7 +4,7 @@
 //   HANG_LOOP    from the 400th cycle on the main loop stands, the sensing engine runs on
 //   HANG_LIT     the same, with interrupts off at a moment when emitters are lit
 //   BLOCK        interrupts are off for 250 us in every 16th cycle, later and later in it
-//   SHORT_BLOCK  the same for 6 us
+//   SHORT_BLOCK  the same for 6 us, in every second
 //   SLOW         5 ms of work for cycles that come every millisecond
 // It is told by bytes without any frame around them: a letter and structs as they lie in memory
 // (port_app.py).
@@ -40,8 +40,9 @@ void app_on_cycle(const struct hal_cycle *cycle)
         answer(TYPE_CYCLE, cycle, sizeof *cycle);
     if (BAD == SLOW)
         _delay_ms(5);
-    if ((BAD == BLOCK || BAD == SHORT_BLOCK) && cycles % 16 == 0) {
-        for (uint8_t i = cycles / 16 & 63; i != 0; i--)
+    const uint8_t every = BAD == BLOCK ? 16 : 2;
+    if ((BAD == BLOCK || BAD == SHORT_BLOCK) && cycles % every == 0) {
+        for (uint8_t i = cycles / every & 63; i != 0; i--)
             _delay_us(13);
         cli();
         _delay_us(BAD == BLOCK ? 250 : 6);
