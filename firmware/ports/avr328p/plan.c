@@ -11,6 +11,8 @@
 #include <avr/pgmspace.h>
 #include <string.h>
 
+#define ONCE __attribute__((noinline))   // in flash
+
 #pragma GCC optimize("Os")          // runs when an exposure changes
 
 const uint8_t plan_place[2][HAL_CHANNELS] PROGMEM = {
@@ -53,45 +55,37 @@ void plan_clip(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t wiring, uint16_t 
     }
 }
 
-// In registers while a list is written.
-struct writer {
-    uint8_t *to;
-    uint8_t *word;                      // of the event before
-    int16_t match;                      // its compare match, from the trigger of the half's first slot
-};
+// The list being written. Times are cycles until the sample of the pair's second.
+static uint8_t *to;
+static uint8_t *word;                   // of the event before
+static uint16_t match;                  // its compare match
 
-// The list being written.
-static struct writer writer;
-
-static inline __attribute__((always_inline)) void event(struct writer *w, uint8_t kind, int16_t at)
+static ONCE void put(uint8_t byte)
 {
-    const uint16_t delta = at - w->match;
-    w->word[0] = (uint8_t)delta;
-    w->word[1] |= (uint8_t)(delta >> 8);
-    w->match = at;
-    w->word = w->to;
-    w->to[0] = 0;
-    w->to[1] = kind;
-    w->to += 2;
+    *to++ = byte;
 }
 
-static __attribute__((noinline)) uint8_t bit(uint8_t i)
+static ONCE void event(uint8_t kind, uint16_t at)
+{
+    const uint16_t delta = match - at;
+    uint8_t *const before = word;
+    match = at;
+    word = to;
+    before[0] = (uint8_t)delta;
+    before[1] |= (uint8_t)(delta >> 8);
+    put(0);
+    put(kind);
+}
+
+static ONCE uint8_t bit(uint8_t i)
 {
     return 1 << i;
 }
 
-static inline __attribute__((always_inline)) void put(struct writer *w, uint8_t byte)
+static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lights, uint8_t phase,
+                 uint8_t a, uint8_t b)
 {
-    *w->to++ = byte;
-}
-
-static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lights, uint8_t phase)
-{
-    const int16_t slot = (int16_t)plan->slot_cycles;
-    struct writer w = writer;
-    uint8_t *const begin = w.to;
-    const uint8_t a = plan_channel(timing->wiring, 2 * phase);
-    const uint8_t b = plan_channel(timing->wiring, 2 * phase + 1);
+    const uint16_t slot = plan->slot_cycles;
     uint8_t bits = bit(a), more = bit(b);
     uint8_t admux_a = ADMUX_CHANNEL_0 + a, admux_b = ADMUX_CHANNEL_0 + b;
     uint8_t portc = PORTC_ALL & (uint8_t)~(bits | more), portd = PORTD_DARK;
@@ -117,14 +111,13 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
         portd = PORTD_DARK;
     }
 
-    int16_t release = slot + SAMPLE_CYCLES - (int16_t)plan->exposure_cycles[a];
-    int16_t later = 2 * slot + SAMPLE_CYCLES - (int16_t)plan->exposure_cycles[b];
+    uint16_t release = plan->exposure_cycles[a] + slot, later = plan->exposure_cycles[b];
     uint8_t left = 2;
     if (release == later) {
         bits |= more;
         left = 1;
-    } else if (later < release) {
-        const int16_t r = release;
+    } else if (later > release) {
+        const uint16_t r = release;
         const uint8_t m = bits;
         release = later;
         later = r;
@@ -134,38 +127,36 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
 
     // Cycles from setting the lights to the release, if the next release is one that does.
     uint8_t set = LIGHT_LEAD_CYCLES, admux = ADMUX_GROUND;
-    int16_t trigger = -slot;            // of the slot that the service is in
-    int16_t service = HOLD_AT - slot;
+    uint16_t trigger = 3 * slot + SAMPLE_CYCLES;    // of the slot that the service is in
+    uint16_t service = trigger - HOLD_AT;
     for (uint8_t k = 0;; k++) {
         uint8_t released = 0;
         while (left) {
             // A short exposure of the second: the first's is over, so its node may be held once more.
-            uint8_t lead = set;
-            if (release > 2 * slot + SAMPLE_CYCLES - SHORT_CYCLES)
-                lead = SHORT_LEAD_CYCLES;
-            int16_t at = release - (lead ? lead : RELEASE_LEAD_CYCLES);
+            const uint8_t lead = release < SHORT_CYCLES ? SHORT_LEAD_CYCLES : set;
+            uint16_t at = release + (lead ? lead : RELEASE_LEAD_CYCLES);
             // A service right after a release costs no interrupt of its own; but lights go out in time, and
             // the result is read before the next.
             if (k == 0) {
-                if (at >= service + HOLD_CYCLES)
+                if (at + HOLD_CYCLES <= service)
                     break;
                 if (set)
                     at = service;       // no time for holding first
-            } else if (k != 3 && at >= service + SPACING_CYCLES && release > trigger + SERVICE_LATEST) {
+            } else if (k != 3 && at + SPACING_CYCLES <= service && release + SERVICE_LATEST < trigger) {
                 break;
             }
-            event(&w, (lead ? EVENT_SET_RELEASE : EVENT_RELEASE) | EVENT_ALONE, at);
+            event((lead ? EVENT_SET_RELEASE : EVENT_RELEASE) | EVENT_ALONE, at);
             if (lead) {
-                put(&w, portc);
-                put(&w, portd);
-                put(&w, (uint8_t)(release - at - LEAD_LESS_CYCLES));
+                put(portc);
+                put(portd);
+                put((uint8_t)(at - release - LEAD_LESS_CYCLES));
                 set = 0;
             }
-            put(&w, PORTC_ALL & (uint8_t)~bits);
+            put(PORTC_ALL & (uint8_t)~bits);
             // With the release, if the last sample has been taken long enough.
-            released = release >= service + WITH_RELEASE_CYCLES;
-            if (service < release + AFTER_RELEASE_CYCLES)
-                service = release + AFTER_RELEASE_CYCLES;
+            released = release + WITH_RELEASE_CYCLES <= service;
+            if (service > release - AFTER_RELEASE_CYCLES)
+                service = release - AFTER_RELEASE_CYCLES;
             bits |= more;
             release = later;
             left--;
@@ -180,50 +171,41 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
         if (k == 2 && phase != 0)
             kind = EVENT_SERVICE;
         if (released)
-            w.word[1] ^= EVENT_ALONE ^ kind;
+            word[1] ^= EVENT_ALONE ^ kind;
         else
-            event(&w, kind, service);
+            event(kind, service);
         if (k == 0 && phase == 0)
-            plan->first_mux = w.to;
-        put(&w, admux);
+            plan->first_mux = (uint8_t)(to - plan->event);
+        put(admux);
         admux = k == 0 ? admux_a : admux_b;
-        trigger += slot;
-        service = trigger + SERVICE_AT;
+        trigger -= slot;
+        service = trigger - SERVICE_AT;
     }
-    event(&w, phase == 2 ? EVENT_LAST : EVENT_AGAIN, 2 * slot + HOLD_AT);
-    put(&w, (uint8_t)(w.to - begin));
-    plan->end[phase] = (uint8_t)(w.to - plan->event);
-    w.match -= 3 * slot;
-    writer = w;
+    // Here every list begins as well: nothing of this one changes any more.
+    event(phase == 2 ? EVENT_LAST : EVENT_AGAIN, SAMPLE_CYCLES - HOLD_AT);
+    put((uint8_t)(to - plan->event) - plan->begin[phase]);
 }
 
-static void begin_list(struct plan *plan, uint8_t phase)
+uint8_t plan_write(struct plan *plan, const struct plan *from, const struct hal_timing *timing, uint8_t lights,
+                   uint8_t phase)
 {
-    if (phase == 0) {
-        writer.to = plan->event;
-        writer.word = plan->event;
+    const uint8_t a = plan_channel(timing->wiring, 2 * phase), b = plan_channel(timing->wiring, 2 * phase + 1);
+    to = plan->event + plan->begin[phase];
+    word = to;                          // the first event has none before it
+    const uint8_t same = from && plan->exposure_cycles[a] == from->exposure_cycles[a]
+                         && plan->exposure_cycles[b] == from->exposure_cycles[b];
+    if (same) {
+        const uint8_t *at = from->event + from->begin[phase];
+        do
+            put(*at++);
+        while (at != from->event + from->begin[phase + 1]);
+        if (phase == 0) {
+            plan->first_mux = from->first_mux;
+            plan->event[plan->first_mux] = ADMUX_GROUND;    // the other may ask for the supply just now
+        }
+    } else {
+        pair(plan, timing, lights, phase, a, b);
     }
-}
-
-void plan_write(struct plan *plan, const struct hal_timing *timing, uint8_t lights, uint8_t phase)
-{
-    begin_list(plan, phase);
-    pair(plan, timing, lights, phase);
-}
-
-void plan_copy(struct plan *plan, const struct plan *from, uint8_t phase)
-{
-    begin_list(plan, phase);
-    const uint8_t begin = phase ? from->end[phase - 1] : 0;
-    const uint8_t n = from->end[phase] - begin;
-    memcpy(writer.to, from->event + begin, n);
-    writer.to += n;
-    plan->end[phase] = (uint8_t)(writer.to - plan->event);
-    if (phase == 0) {
-        plan->first_mux = plan->event + (from->first_mux - from->event);
-        *plan->first_mux = ADMUX_GROUND;            // the other may ask for the supply just now
-    }
-    // Where every list begins and ends.
-    writer.word = writer.to - 3;
-    writer.match = HOLD_AT - (int16_t)plan->slot_cycles;
+    plan->begin[phase + 1] = (uint8_t)(to - plan->event);
+    return same;
 }

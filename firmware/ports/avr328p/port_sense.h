@@ -68,8 +68,8 @@ enum plan_limits {
 struct plan {
     uint16_t exposure_cycles[HAL_CHANNELS];
     uint16_t slot_cycles;
-    uint8_t *first_mux;             // ADMUX of slot 0
-    uint8_t end[3];                 // of each list, in `event`
+    uint8_t first_mux;              // ADMUX of slot 0, in `event`
+    uint8_t begin[4];               // of each list, in `event`, and their end; the first's is 0
     uint8_t event[PLAN_BYTES];
 };
 
@@ -122,9 +122,9 @@ extern const uint8_t plan_place[2][HAL_CHANNELS];        // in flash
 uint8_t plan_channel(uint8_t wiring, uint8_t place);
 // Limits, and two releases not too near each other.
 void plan_clip(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t wiring, uint16_t slot_cycles);
-// One list, from plan->exposure_cycles, which are clipped, and plan->slot_cycles; in order 0, 1, 2. Or the same
-// as another plan's.
-void plan_write(struct plan *plan, const struct hal_timing *timing, uint8_t lights, uint8_t phase);
-void plan_copy(struct plan *plan, const struct plan *from, uint8_t phase);
+// One list, from plan->exposure_cycles, which are clipped, and plan->slot_cycles; in order 0, 1, 2. Returns 1 if it
+// is a copy of that of `from`, a plan that differs in exposures alone, or NULL.
+uint8_t plan_write(struct plan *plan, const struct plan *from, const struct hal_timing *timing, uint8_t lights,
+                   uint8_t phase);
 
 #endif

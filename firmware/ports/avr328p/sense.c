@@ -157,8 +157,8 @@ SELDOM static void ask_supply(struct plan *plan, uint8_t of)
         return;
     supply = SUPPLY_ASKED;
     supply_of = of;
-    *plan->first_mux = ADMUX_SUPPLY;
-    sense_first = plan->first_mux;
+    sense_first = plan->event + plan->first_mux;
+    *sense_first = ADMUX_SUPPLY;
 }
 
 // Its other GND slot must be over, and the same plan go on. Interrupts stay on: what is left of the cycle is
@@ -333,14 +333,8 @@ SELDOM static uint8_t write_plan(void)
         memcpy(plan->exposure_cycles, exposure, sizeof exposure);
         plan->slot_cycles = slot;
     }
-    const struct plan *now_used = &sense_plan[plan_next];
-    const uint8_t a = plan_channel(timing.wiring, 2 * written), b = plan_channel(timing.wiring, 2 * written + 1);
-    const uint8_t copied = !(plan_hurry & HURRY_WHOLE) && plan->exposure_cycles[a] == now_used->exposure_cycles[a]
-                           && plan->exposure_cycles[b] == now_used->exposure_cycles[b];
-    if (copied)
-        plan_copy(plan, now_used, written);
-    else
-        plan_write(plan, &timing, timing.lights && !locked_out, written);
+    const uint8_t copied = plan_write(plan, plan_hurry & HURRY_WHOLE ? NULL : &sense_plan[plan_next], &timing,
+                                      timing.lights && !locked_out, written);
     if (++written != 3)
         return copied;
     written = 0;
