@@ -76,10 +76,9 @@ void hal_set_timing(struct hal_timing *timing);
 uint16_t hal_exposure_most(uint8_t channel);
 
 // Encode a packet (sg_wire_encode_ring: n + 8 bytes) into the send queue if at least keep_free bytes of the
-// queue stay free after it. n <= SG_WIRE_BODY_MAX. Returns 1, or 0 if not queued.
+// queue stay free after it. n <= SG_WIRE_BODY_MAX. Returns 1, or 0 if not queued. Without a head, NULL, that is
+// only asked: 1 if it would be queued.
 uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_t keep_free);
-// Bytes of the queue that are free.
-uint8_t hal_room(void);
 
 // Once everything queued has left: change the line speed, or reset through the watchdog (slow writes are
 // finished first). Until then hal_send() refuses.

@@ -131,7 +131,7 @@ NOT_KEPT static void answer(void)
         return;
     // With room for an answer and for as much of the streams, so that none of them is left out for it, unless the
     // line never has that.
-    if (hal_room() < (waited > PATIENCE_CYCLES ? 1 : 2) * SG_WIRE_FRAME_MAX) {
+    if (!hal_send(NULL, NULL, SG_WIRE_BODY_MAX, waited > PATIENCE_CYCLES ? 0 : SG_WIRE_FRAME_MAX)) {
         refused = 1;
         return;
     }

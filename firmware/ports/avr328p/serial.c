@@ -170,7 +170,7 @@ void serial_start(void)
     UCSR0B = POLLED;
 }
 
-uint8_t hal_room(void)
+static uint8_t room(void)
 {
     const uint8_t tail = tx_tail, head = tx_head;
     return (tail > head ? tail : tail + TX_RING) - head - 1;
@@ -178,13 +178,15 @@ uint8_t hal_room(void)
 
 uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_t keep_free)
 {
-    if (after_pending || (uint16_t)n + AROUND_BODY + keep_free > hal_room())
+    if (after_pending || (uint16_t)n + AROUND_BODY + keep_free > room())
         return 0;
+    if (!head)
+        return 1;
     const uint8_t end = (uint8_t)sg_wire_encode_ring(head, body, n, tx_ring, TX_RING, tx_head);
     __asm__ volatile("" : : : "memory");      // the bytes are there before they are sent
     tx_head = end;
     const uint8_t polled = keep_free && n > LONG_BODY ? POLLED_LONG : POLLED_BYTES;
-    const uint8_t waiting = TX_RING - 1 - hal_room();
+    const uint8_t waiting = TX_RING - 1 - room();
     if (waiting > polled + SENT_MEANWHILE) {
         // Not much more by the interrupt than this packet has: the polling works off an answer, bit by bit.
         uint8_t sent = waiting - polled;

@@ -17,7 +17,7 @@ static uint16_t used(void)
     return (uint8_t)(tx_head - tx_tail);
 }
 
-uint8_t hal_room(void)
+static uint8_t room(void)
 {
     return (uint8_t)(TX_RING - 1 - used());
 }
@@ -34,9 +34,10 @@ void serial_start(void)
 
 uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_t keep_free)
 {
-    if (after_pending || hal_room() < n + AROUND_BODY + keep_free)
+    if (after_pending || room() < n + AROUND_BODY + keep_free)
         return 0;
-    tx_head = (uint8_t)sg_wire_encode_ring(head, body, n, tx_ring, TX_RING, tx_head);
+    if (head)
+        tx_head = (uint8_t)sg_wire_encode_ring(head, body, n, tx_ring, TX_RING, tx_head);
     return 1;
 }
 

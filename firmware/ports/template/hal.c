@@ -61,11 +61,6 @@ uint16_t hal_exposure_most(uint8_t channel)
     return EXPOSURE_MOST_CYCLES;
 }
 
-uint8_t hal_room(void)
-{
-    return 0;
-}
-
 uint8_t hal_send(const struct sg_head *head, const void *body, uint8_t n, uint8_t keep_free)
 {
     (void)head;
