@@ -12,7 +12,7 @@
 
 #include <stdint.h>
 
-#include "sg_light.h"
+#include "sg_reading.h"
 
 // cdef begin
 enum sg_expose_limits {

@@ -7,7 +7,7 @@ enum {
     // Above the middle of what was calibrated. Of eleven simulated persons ten never leave 1.5 octaves, lids shut or
     // open, wherever the eye looks and whatever its pupil; lids of one that stay shut make 1.64 in one channel. A
     // finger before the brightest LED makes 1.5 to 1.9, before the others more than 2.2.
-    ABOVE = OCTAVE + OCTAVE / 2,
+    ABOVE = OCTAVE + (OCTAVE >> 1),
     MIDDLE_STEPS = 2048,        // of the model's range
     // A node without an LED has the pin's 6 pF and takes 14 of 20 parts of what the sample capacitor held:
     // 7/10 of the code before. It follows that code even as it moves, which no LED does.

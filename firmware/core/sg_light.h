@@ -23,6 +23,8 @@
 
 #include <stdint.h>
 
+#include "sg_reading.h"
+
 // cdef begin
 enum sg_light_limits {
     SG_LIGHT_CHANNELS = 6,
@@ -35,16 +37,6 @@ enum sg_light_limits {
 // Bits returned by sg_light_features; the values are those of enum sg_flag (sg_wire.h), which this module
 // does not include.
 enum sg_light_flag { SG_LIGHT_SATURATED = 8, SG_LIGHT_STARVED = 16 };
-
-// What the port saw in one sensing cycle.
-struct sg_reading {
-    uint16_t lit_code[6];           // 0..1023
-    uint16_t unlit_code[6];
-    uint16_t exposure_cycles[6];    // release to sample as planned, the same lit and unlit
-    uint8_t late_lit_cycles[6];     // how much shorter than planned it was, 255 = that or more
-    uint8_t late_unlit_cycles[6];
-    uint16_t held_code;             // what the sample capacitor held before the first lit sample, mostly 0
-};
 
 struct sg_light_channel {
     int32_t sum_q5;                 // signal of the cycles added, 1/32 code at 0 V
