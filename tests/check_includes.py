@@ -18,7 +18,7 @@ CORE = {
     "sg_wire": {"sg_err"},
     "sg_model": {"sg_err", "sg_q", "sg_rom", "sg_crc32_table"}, "sg_crc32_table": {"sg_rom"},
     "sg_reading": set(),
-    "sg_light": {"sg_rom", "sg_reading", "sg_light_loop", "sg_light_table"},
+    "sg_light": {"sg_rom", "sg_reading", "sg_light_loop", "sg_light_table", "sg_light_avr"},
     "sg_light_loop": {"sg_rom", "sg_light", "sg_light_table"}, "sg_light_table": {"sg_light_loop", "sg_rom"},
     "sg_light_avr": {"sg_light_table"},
     "sg_expose": {"sg_reading"}, "sg_health": set(),
@@ -35,7 +35,8 @@ ARCHITECTURE = re.compile(r"__AVR|__arm__|__ARM|__x86_64|__i386|_M_X64|__riscv|_
 ARCHITECTURE_FILES = {"sg_rom.h", "sg_gp_avr.S", "sg_mlp_avr.S", "sg_light_avr.S"}
 # Besides include guards.
 CONDITIONS = {"sg_gp_loop.c": {"SG_GP_ASSEMBLY"}, "sg_gp_loop.h": {"SG_GP_ASSEMBLY"},
-              "sg_mlp_loop.c": {"SG_MLP_ASSEMBLY"}, "sg_light_loop.c": {"SG_LIGHT_ASSEMBLY"}}
+              "sg_mlp_loop.c": {"SG_MLP_ASSEMBLY"}, "sg_light_loop.c": {"SG_LIGHT_ASSEMBLY"},
+              "sg_light.h": {"SG_LIGHT_ASSEMBLY"}}
 FORBIDDEN = {
     r"\b(float|double|long double)\b": "floating point",
     r"\b\d+\.\d*[fF]?\b|\b\d+[eE][-+]?\d+\b": "a floating-point constant",

@@ -24,6 +24,7 @@
 #include <stdint.h>
 
 #include "sg_reading.h"
+#include "sg_rom.h"
 
 // cdef begin
 enum sg_light_limits {
@@ -90,5 +91,9 @@ void sg_light_add(struct sg_light *light, const struct sg_reading *reading);
 // Returns    bits of enum sg_light_flag, or-ed over the channels.
 uint8_t sg_light_features(struct sg_light *light, uint16_t feature[6]);
 // cdef end
+
+#ifdef SG_LIGHT_ASSEMBLY
+#include "sg_light_avr.h"
+#endif
 
 #endif

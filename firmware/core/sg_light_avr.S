@@ -103,14 +103,13 @@
 .endm
 
 ; ---- void sg_light_add(struct sg_light *light r25:r24, const struct sg_reading *reading r23:r22)
-; On the stack: struct sg_light_pass, for the twin.
+; On the stack: struct sg_light_pass, for the twin. No register is saved but r28 and r29 (sg_light_avr.h).
     .section .text.sg_light_add, "ax", @progbits
     .global sg_light_add
     .type sg_light_add, @function
 sg_light_add:
-    .irp r, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 28, 29
-    push r\r
-    .endr
+    push r28
+    push r29
     movw lightl, r24
     movw readingl, r22
     clr zero
@@ -310,7 +309,7 @@ moves:
     com r31
     neg r30
     sbci r31, -1
-4:  subi r31, LEAP_HIGH
+4:  cpi r31, LEAP_HIGH
     brlo 5f
     movw r0, r20                ; a leap? The twin asks exactly, half of the larger code is asked here
     tst r23
@@ -537,9 +536,8 @@ next:
     ori r20, MOVES + BEGINS
 9:  std Y + LIGHT_STATE, r20
 7:  clr r1
-    .irp r, 29, 28, 17, 16, 15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2
-    pop r\r
-    .endr
+    pop r29
+    pop r28
     ret
 
 other:                          ; r26: the channel, untouched so far
