@@ -15,7 +15,7 @@ FREESTANDING = {"stddef.h", "stdint.h", "stdbool.h", "limits.h", "stdalign.h"}
 # other.
 CORE = {
     "sg_q": set(), "sg_rom": set(), "sg_err": set(),
-    "sg_wire": {"sg_err"},
+    "sg_wire": {"sg_err", "sg_rom", "sg_wire_avr"}, "sg_wire_avr": set(),
     "sg_model": {"sg_err", "sg_q", "sg_rom", "sg_crc32_table"}, "sg_crc32_table": {"sg_rom"},
     "sg_reading": set(),
     "sg_light": {"sg_rom", "sg_reading", "sg_light_loop", "sg_light_table", "sg_light_avr"},
@@ -32,11 +32,12 @@ CORE = {
 }
 ARCHITECTURE = re.compile(r"__AVR|__arm__|__ARM|__x86_64|__i386|_M_X64|__riscv|__thumb|_WIN32|__linux__|"
                           r"__APPLE__")
-ARCHITECTURE_FILES = {"sg_rom.h", "sg_gp_avr.S", "sg_mlp_avr.S", "sg_light_avr.S"}
+ARCHITECTURE_FILES = {"sg_rom.h", "sg_gp_avr.S", "sg_mlp_avr.S", "sg_light_avr.S", "sg_wire_avr.S"}
 # Besides include guards.
 CONDITIONS = {"sg_gp_loop.c": {"SG_GP_ASSEMBLY"}, "sg_gp_loop.h": {"SG_GP_ASSEMBLY"},
               "sg_mlp_loop.c": {"SG_MLP_ASSEMBLY"}, "sg_light_loop.c": {"SG_LIGHT_ASSEMBLY"},
-              "sg_light.h": {"SG_LIGHT_ASSEMBLY"}}
+              "sg_light.h": {"SG_LIGHT_ASSEMBLY"},
+              "sg_wire.c": {"SG_WIRE_ASSEMBLY"}, "sg_wire.h": {"SG_WIRE_ASSEMBLY"}}
 FORBIDDEN = {
     r"\b(float|double|long double)\b": "floating point",
     r"\b\d+\.\d*[fF]?\b|\b\d+[eE][-+]?\d+\b": "a floating-point constant",

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// How the compiler calls sg_light_add() of sg_light_avr.S, which saves no register but r28 and r29: its caller
-// keeps next to nothing in the others, once a cycle. Included by sg_light.h alone.
+// How the compiler calls sg_light_add() of sg_light_avr.S, which saves no register but r28 and r29: its
+// caller keeps next to nothing in the others, once a cycle. Included by sg_light.h alone.
 #ifndef SG_LIGHT_AVR_H
 #define SG_LIGHT_AVR_H
 

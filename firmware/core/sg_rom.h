@@ -25,6 +25,11 @@ enum sg_rom_space { SG_ROM_MEMORY = 0, SG_ROM_FLASH = 1 };
 #define SG_LIGHT_ASSEMBLY
 #endif
 
+// The same of sg_wire's encoder.
+#if defined(__AVR__) && !defined(SG_WIRE_PORTABLE)
+#define SG_WIRE_ASSEMBLY
+#endif
+
 #ifdef __AVR__
 #include <avr/pgmspace.h>
 #define SG_ROM PROGMEM

@@ -26,6 +26,7 @@ uint16_t sg_wire_crc16(uint16_t crc, const uint8_t *data, size_t n)
     return (uint16_t)(((uint16_t)now.high << 8) | now.low);
 }
 
+#ifndef SG_WIRE_ASSEMBLY
 // COBS into a ring. A packet has at most 70 bytes, so no group reaches the 254 bytes at which COBS needs a second
 // rule.
 struct out {
@@ -74,6 +75,7 @@ uint16_t sg_wire_encode_ring(const struct sg_head *head, const void *body, uint8
     *out.next = 0;
     return (uint16_t)((++out.next == out.end ? ring : out.next) - ring);
 }
+#endif
 
 int sg_wire_encode(const struct sg_head *head, const void *body, size_t body_bytes, uint8_t *out)
 {

@@ -14,6 +14,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "sg_rom.h"
+
 // cdef begin
 enum sg_wire_limits {
     SG_WIRE_VERSION = 3,
@@ -307,5 +309,9 @@ _Static_assert(sizeof(struct sg_curve) == 8, "wire layout");
 _Static_assert(sizeof(struct sg_probe) == 14, "wire layout");
 _Static_assert(sizeof(struct sg_recentre) == 10, "wire layout");
 _Static_assert(sizeof(struct sg_error) == 2, "wire layout");
+
+#ifdef SG_WIRE_ASSEMBLY
+#include "sg_wire_avr.h"
+#endif
 
 #endif

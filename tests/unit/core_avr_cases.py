@@ -111,8 +111,8 @@ def run_cases(directory, body, inputs, out_bytes, includes=(), setup="", data=No
     if wrap:
         wrapped += MARKED.format(name=wrap, **_marks(SECTION_FUNCTION))
     (directory / "case_wrap.S").write_text(wrapped, encoding="utf-8")
-    own = [compile_one(directory / name, directory, (f"-I{directory}",))
-           for name in ("case_main.c", "case_wrap.S")]
+    flags = (f"-I{directory}", *(f"-D{define}" for define in defines))
+    own = [compile_one(directory / name, directory, flags) for name in ("case_main.c", "case_wrap.S")]
     objects = core_objects(tuple(defines))
     elf = directory / "case.elf"
     avr.run([avr.avr_tool("avr-gcc"), *avr.AVR_FLAGS, "-Wl,--gc-sections",
