@@ -87,7 +87,7 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
 {
     const uint16_t slot = plan->slot_cycles;
     uint8_t bits = bit(a), more = bit(b);
-    uint8_t admux_a = ADMUX_CHANNEL_0 + a, admux_b = ADMUX_CHANNEL_0 + b;
+    uint8_t admux[3] = { ADMUX_GROUND, ADMUX_CHANNEL_0 + a, ADMUX_CHANNEL_0 + b };
     uint8_t portc = PORTC_ALL & (uint8_t)~(bits | more), portd = PORTD_DARK;
 
     if (timing->wiring != SG_WIRING_LEDS) {
@@ -99,11 +99,11 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
         portc = bit(timing->probe);
         if (bits == portc) {
             bits = 0;
-            admux_a = ADMUX_GROUND;
+            admux[1] = ADMUX_GROUND;
         }
         if (more == portc) {
             more = 0;
-            admux_b = ADMUX_GROUND;
+            admux[2] = ADMUX_GROUND;
         }
     }
     if (!lights) {
@@ -112,10 +112,9 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
     }
 
     uint16_t release = plan->exposure_cycles[a] + slot, later = plan->exposure_cycles[b];
-    uint8_t left = 2;
     if (release == later) {
         bits |= more;
-        left = 1;
+        later = 0;                      // none
     } else if (later > release) {
         const uint16_t r = release;
         const uint8_t m = bits;
@@ -126,12 +125,12 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
     }
 
     // Cycles from setting the lights to the release, if the next release is one that does.
-    uint8_t set = LIGHT_LEAD_CYCLES, admux = ADMUX_GROUND;
+    uint8_t set = LIGHT_LEAD_CYCLES;
     uint16_t trigger = 3 * slot + SAMPLE_CYCLES;    // of the slot that the service is in
     uint16_t service = trigger - HOLD_AT;
     for (uint8_t k = 0;; k++) {
         uint8_t released = 0;
-        while (left) {
+        while (release) {
             // A short exposure of the second: the first's is over, so its node may be held once more.
             const uint8_t lead = release < SHORT_CYCLES ? SHORT_LEAD_CYCLES : set;
             uint16_t at = release + (lead ? lead : RELEASE_LEAD_CYCLES);
@@ -159,25 +158,22 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
                 service = release - AFTER_RELEASE_CYCLES;
             bits |= more;
             release = later;
-            left--;
+            later = 0;
         }
         if (k == 3)
             break;
         uint8_t kind = EVENT_STORE;
         if (k == 0 && set)
             kind = EVENT_DARK_STORE;
-        if (k == 1 && phase == 0)
-            kind = EVENT_COMPLETE;
-        if (k == 2 && phase != 0)
-            kind = EVENT_SERVICE;
+        if (k == (phase == 0 ? 1 : 2))
+            kind = phase == 0 ? EVENT_COMPLETE : EVENT_SERVICE;
         if (released)
             word[1] ^= EVENT_ALONE ^ kind;
         else
             event(kind, service);
         if (k == 0 && phase == 0)
             plan->first_mux = (uint8_t)(to - plan->event);
-        put(admux);
-        admux = k == 0 ? admux_a : admux_b;
+        put(admux[k]);
         trigger -= slot;
         service = trigger - SERVICE_AT;
     }
@@ -186,19 +182,26 @@ static void pair(struct plan *plan, const struct hal_timing *timing, uint8_t lig
     put((uint8_t)(to - plan->event) - plan->begin[phase]);
 }
 
+static ONCE uint8_t equal(const struct plan *plan, const struct plan *from, uint8_t channel)
+{
+    return plan->exposure_cycles[channel] == from->exposure_cycles[channel];
+}
+
 uint8_t plan_write(struct plan *plan, const struct plan *from, const struct hal_timing *timing, uint8_t lights,
                    uint8_t phase)
 {
     const uint8_t a = plan_channel(timing->wiring, 2 * phase), b = plan_channel(timing->wiring, 2 * phase + 1);
-    to = plan->event + plan->begin[phase];
+    uint8_t *const begin = &plan->begin[phase];
+    to = plan->event + begin[0];
     word = to;                          // the first event has none before it
-    const uint8_t same = from && plan->exposure_cycles[a] == from->exposure_cycles[a]
-                         && plan->exposure_cycles[b] == from->exposure_cycles[b];
+    const uint8_t same = from && equal(plan, from, a) && equal(plan, from, b);
     if (same) {
-        const uint8_t *at = from->event + from->begin[phase];
+        const uint8_t *const other = &from->begin[phase];
+        const uint8_t *at = from->event + other[0];
+        uint8_t left = other[1] - other[0];
         do
             put(*at++);
-        while (at != from->event + from->begin[phase + 1]);
+        while (--left);
         if (phase == 0) {
             plan->first_mux = from->first_mux;
             plan->event[plan->first_mux] = ADMUX_GROUND;    // the other may ask for the supply just now
@@ -206,6 +209,6 @@ uint8_t plan_write(struct plan *plan, const struct plan *from, const struct hal_
     } else {
         pair(plan, timing, lights, phase, a, b);
     }
-    plan->begin[phase + 1] = (uint8_t)(to - plan->event);
+    begin[1] = (uint8_t)(to - plan->event);
     return same;
 }
