@@ -18,6 +18,12 @@ enum {
     WATCH_LOOKS = 5,            // 30 ms: five phases of a period of 10 ms
 };
 
+// Is a larger than b by more than this?
+static uint8_t above(uint8_t a, uint8_t b, uint8_t by)
+{
+    return a > b && (uint8_t)(a - b) > by;
+}
+
 static uint16_t clipped(uint16_t cycles, uint16_t most)
 {
     if (cycles > most)
@@ -103,7 +109,7 @@ static uint8_t full(struct sg_expose_led *led, uint16_t unlit)
 {
     const uint8_t settled = led->stage == SG_EXPOSE_TRACK;
     // Gaze or lids: no more than is needed.
-    const uint8_t ours = settled && (uint8_t)(unlit >> 2) <= led->unlit_then + RISEN_Q2;
+    const uint8_t ours = settled && !above((uint8_t)(unlit >> 2), led->unlit_then, RISEN_Q2);
     const uint8_t shift = unlit >= SG_EXPOSE_SATURATED_CODE ? 4 : ours ? 1 : 3;
     const uint16_t now = within(led, led->exposure_cycles >> shift);
     if (now >= led->exposure_cycles)
@@ -169,8 +175,8 @@ static uint8_t look(const struct sg_expose *expose, struct sg_expose_led *led, u
     const uint16_t load_then_q2 = (uint16_t)(led->unlit_peak + 2U * led->signal_then);
     const uint8_t longer = led->exposure_cycles < led->most_cycles;
     // What ambient light did, with the signal as it was when the exposure was chosen: gaze has no part in it.
-    const uint8_t risen = load_then_q2 > BRIGHT_Q2 && led->unlit_peak > led->unlit_then + RISEN_Q2;
-    const uint8_t freed = longer && led->unlit_then > led->unlit_peak + FREED_Q2;
+    const uint8_t risen = load_then_q2 > BRIGHT_Q2 && above(led->unlit_peak, led->unlit_then, RISEN_Q2);
+    const uint8_t freed = longer && above(led->unlit_then, led->unlit_peak, FREED_Q2);
     if (risen || freed)
         return choose(led, led->signal_then);
     // What our own light did must last.
@@ -230,22 +236,29 @@ ONCE static uint16_t own(uint16_t code, uint16_t code_before)
     return alone < 0 ? 0 : (uint16_t)alone;
 }
 
+// A reading whose [0] are those of channel i: all of its arrays of words at once, by one address.
+static const struct sg_reading *from_channel(const struct sg_reading *reading, uint8_t i)
+{
+    return (const struct sg_reading *)(const void *)((const uint16_t *)(const void *)reading + i);
+}
+
 // A channel in this cycle; what waits for its turn only if it is that. Returns 1 if its exposure changed.
 static uint8_t visit(struct sg_expose *expose, const struct sg_reading *reading, uint8_t wiring, uint8_t i)
 {
     struct sg_expose_led *led = &expose->led[i];
-    if (reading->exposure_cycles[i] != led->exposure_cycles)
+    const struct sg_reading *const own_reading = from_channel(reading, i);
+    if (own_reading->exposure_cycles[0] != led->exposure_cycles)
         return 0;
-    uint16_t lit = reading->lit_code[i], unlit = reading->unlit_code[i];
+    uint16_t lit = own_reading->lit_code[0], unlit = own_reading->unlit_code[0];
     // Two full without our light: so much of it came that the others will be, and all change at once.
     if (expose->drowned >= 2 && led->stage == SG_EXPOSE_TRACK)
         unlit = SG_EXPOSE_SATURATED_CODE;
     if (lit >= SG_EXPOSE_SATURATED_CODE || unlit >= SG_EXPOSE_SATURATED_CODE)
         return full(led, unlit);
     const uint8_t bright = lit > SG_EXPOSE_BRIGHT_CODE;
-    const uint8_t first = before(i, wiring);
-    lit = own(lit, reading->lit_code[first]);
-    unlit = own(unlit, reading->unlit_code[first]);
+    const struct sg_reading *const first = from_channel(reading, before(i, wiring));
+    lit = own(lit, first->lit_code[0]);
+    unlit = own(unlit, first->unlit_code[0]);
     if (i == expose->next && led->stage > SG_EXPOSE_REFINE)
         watch_ambient(expose, led, unlit);
     if (led->stage <= SG_EXPOSE_REFINE)
