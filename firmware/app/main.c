@@ -19,9 +19,10 @@ enum {
     JUMP_DEG_Q1 = 3,                    // a degree in 1024 us is one in 512 us
     CALM_256US = 32,
     FRESH_256US = 20,                   // the next frame of four cycles
+    // One of these beside a frame's work: two at once make the next frame late.
     BYTES_US = 130,                     // a look at the line
-    DECODE_US = 90,                     // a packet
-    REQUEST_US = 130,                   // a request, and its answer
+    DECODE_US = 150,                    // a packet
+    REQUEST_US = 145,                   // a request, and its answer
     // One that makes a frame late is done after so many cycles, if no frame is late yet: it takes 500 us, a
     // long one and receiving the next 2 us a byte more, and readings are lost when work is behind by a period.
     PATIENCE_CYCLES = 6,
@@ -138,7 +139,7 @@ NOT_KEPT static void answer(void)
     if (!time_for_line(REQUEST_US))
         return;
     heard.waiting = waited = 0;
-    memcpy(app_body.bytes, app.link.frame + SG_WIRE_HEAD_BYTES, sizeof app_body.bytes);
+    memcpy(app_body.bytes, app.link.frame + SG_WIRE_HEAD_BYTES, heard.bytes);
     app_request(&heard.head, heard.bytes, heard.zero_us);
 }
 

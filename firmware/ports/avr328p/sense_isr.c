@@ -207,11 +207,7 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "ld r24, Z+" "\n\t"
         "and r24, r25" "\n\t"
         "ori r24, %[dark]" "\n\t"
-        "out %[portd], r24" "\n"
-        "sense_wait_lit:" "\t"
-        "lds r24, %[state]" "\n\t"
-        "sbrc r24, %[came]" "\n\t"
-        "rjmp sense_receive_first" "\n\t"
+        "out %[portd], r24" "\n\t"
         "ld r25, Z+" "\n\t"
         "rjmp 2f" "\n"
         "1:" "\t" "ldi r25, %[lead]" "\n"
@@ -485,11 +481,8 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
           [wait] "i"(sense_wait), [turn] "i"(&sense_turn), [turns] "M"(sizeof(struct late)),
           [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [list_low] "I"(_SFR_IO_ADDR(OCR0A)),
           [list_high] "I"(_SFR_IO_ADDR(OCR0B)));
-    // The receiver holds no more than comes while a release is waited for.
-    __asm__ volatile("sense_receive_first:" "\t"
-                     "rcall sense_byte_z" "\n\t"
-                     "rjmp sense_wait_lit" "\n"
-                     "sense_byte_z:" "\t"               // the same, and Z stays
+    // The receiver holds what comes while a release is waited for: a look at it first made the release late.
+    __asm__ volatile("sense_byte_z:" "\t"               // the same, and Z stays
                      "push r30" "\n\t"
                      "push r31" "\n\t"
                      "rcall sense_byte" "\n\t"
