@@ -22,7 +22,7 @@ enum {
     // One of these beside a frame's work: two at once make the next frame late.
     BYTES_US = 130,                     // a look at the line
     DECODE_US = 150,                    // a packet
-    REQUEST_US = 145,                   // a request, and its answer
+    REQUEST_US = 157,                   // a request, and its answer
     // One that makes a frame late is done after so many cycles, if no frame is late yet: it takes 500 us, a
     // long one and receiving the next 2 us a byte more, and readings are lost when work is behind by a period.
     PATIENCE_CYCLES = 6,
