@@ -119,7 +119,7 @@ def port_with(repo_root, avr_tools, tmp_path_factory):
             [avr_tools / "avr-gcc", "-mmcu=atmega328p", "-DF_CPU=16000000L", "-std=gnu11", "-O2",
              "-Wall", "-Wextra", "-Werror", *flags,
              *[f"-I{firmware / part}" for part in ("core", "app", "ports/avr328p")],
-             source, firmware / "core" / "sg_wire.c",
+             source, firmware / "core" / "sg_wire.c", firmware / "core" / "sg_wire_avr.S",
              *sorted((firmware / "ports" / "avr328p").glob("*.c")), "-o", out], check=True)
         return out
 

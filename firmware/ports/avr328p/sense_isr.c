@@ -207,9 +207,17 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         "ld r24, Z+" "\n\t"
         "and r24, r25" "\n\t"
         "ori r24, %[dark]" "\n\t"
-        "out %[portd], r24" "\n\t"
+        "out %[portd], r24" "\n"
+        "sense_wait_lit:" "\t"
         "ld r25, Z+" "\n\t"
-        "rjmp 2f" "\n"
+        "cpi r25, %[patient]" "\n\t"          // a look at the receiver would make the others late
+        "brlo 2f" "\n\t"
+        "lds r24, %[state]" "\n\t"
+        "sbrs r24, %[came]" "\n\t"
+        "rjmp 2f" "\n\t"
+        "rcall sense_byte_z" "\n\t"
+        "sbiw r30, 1" "\n\t"
+        "rjmp sense_wait_lit" "\n"
         "1:" "\t" "ldi r25, %[lead]" "\n"
         "2:" "\t" "ld r24, Z+" "\n\t"
         "out %[list_low], r30" "\n\t"
@@ -305,6 +313,7 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
         : : [portc] "I"(_SFR_IO_ADDR(PORTC)), [ddrc] "I"(_SFR_IO_ADDR(DDRC)),
           [portd] "I"(_SFR_IO_ADDR(PORTD)),
           [all] "M"(PORTC_ALL), [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [dark] "M"(PORTD_DARK),
+          [patient] "M"(SHORT_LEAD_CYCLES - LEAD_LESS_CYCLES),
           [lead] "M"(RELEASE_LEAD_CYCLES - LEAD_LESS_CYCLES), [list_low] "I"(_SFR_IO_ADDR(OCR0A)),
           [list_high] "I"(_SFR_IO_ADDR(OCR0B)), [now] "i"(_SFR_MEM_ADDR(TCNT1L)),
           [match] "i"(_SFR_MEM_ADDR(OCR1AL)), [fixed] "M"(RELEASE_FIXED_CYCLES - LEAD_LESS_CYCLES),
@@ -481,8 +490,7 @@ ISR(TIMER1_COMPA_vect, ISR_NAKED)
           [wait] "i"(sense_wait), [turn] "i"(&sense_turn), [turns] "M"(sizeof(struct late)),
           [lit] "I"(_SFR_IO_ADDR(GPIOR2)), [list_low] "I"(_SFR_IO_ADDR(OCR0A)),
           [list_high] "I"(_SFR_IO_ADDR(OCR0B)));
-    // The receiver holds what comes while a release is waited for: a look at it first made the release late.
-    __asm__ volatile("sense_byte_z:" "\t"               // the same, and Z stays
+    __asm__ volatile("sense_byte_z:" "\t"               // sense_byte, and Z stays
                      "push r30" "\n\t"
                      "push r31" "\n\t"
                      "rcall sense_byte" "\n\t"
