@@ -121,6 +121,9 @@ void app_sense_cycle(const struct hal_cycle *cycle);        // exposure and heal
 void app_sense_step(void);                                  // on with a change of exposures
 uint8_t app_alarm(void);                                    // bits of enum sg_alarm
 uint8_t app_fault(void);                                    // 1: the gaze is not to be trusted
+// Exposures wanted now; and is one of them off these by more than 1/2^shift?
+void app_exposures(uint16_t cycles[HAL_CHANNELS]);
+uint8_t app_exposures_far(const uint16_t cycles[HAL_CHANNELS], uint8_t shift);
 void app_expose_by(uint8_t op, const uint16_t exposure_us_q4[HAL_CHANNELS]);    // enum sg_exposure_op
 int8_t app_probe(uint8_t emitter, uint16_t seq);            // SG_OK: begun, answers by itself when done
 uint8_t app_probing(void);                                  // 1: the cycle just added belongs to a probe

@@ -66,8 +66,7 @@ void app_live_changed(void)
 
 SELDOM static void keep_exposures(void)
 {
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        app_live.exposure_cycles[i] = app.expose.led[i].exposure_cycles;
+    app_exposures(app_live.exposure_cycles);
     app_live.exposure_auto = app.exposure_auto;
     dirty = 1;
 }
@@ -95,13 +94,9 @@ SELDOM static void look(void)
     if (--looks != 0)
         return;
     looks = 1;
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
-        const uint16_t now = app.expose.led[i].exposure_cycles, stored = app_live.exposure_cycles[i];
-        if ((now > stored ? now - stored : stored - now) > stored >> 3) {
-            keep_exposures();
-            looks = LOOKS_LATER;
-            return;
-        }
+    if (app_exposures_far(app_live.exposure_cycles, 3)) {
+        keep_exposures();
+        looks = LOOKS_LATER;
     }
 }
 

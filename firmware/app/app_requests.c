@@ -76,8 +76,7 @@ SELDOM static int8_t exposure(struct sg_exposure *io)
     if (io->op > SG_EXPOSURE_LIMIT)
         return SG_E_ARG;
     app_expose_by(io->op, io->exposure_us_q4);
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        io->exposure_us_q4[i] = app.expose.led[i].exposure_cycles;
+    app_exposures(io->exposure_us_q4);
     io->op = app.exposure_auto ? SG_EXPOSURE_AUTO : SG_EXPOSURE_HOLD;
     io->reserved = 0;
     return SG_OK;

@@ -51,12 +51,17 @@ uint8_t app_fault(void)
     return faulty | alarms;
 }
 
+SELDOM void app_exposures(uint16_t cycles[HAL_CHANNELS])
+{
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+        cycles[i] = app.expose.led[i].exposure_cycles;
+}
+
 // Ask the port for the exposures wanted, and for the rest take what it made of them.
 SELDOM static void expose(void)
 {
     uint16_t cycles[HAL_CHANNELS];
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        cycles[i] = app.expose.led[i].exposure_cycles;
+    app_exposures(cycles);
     hal_expose(cycles);
     sg_expose_taken(&app.expose, cycles);
 }
@@ -77,8 +82,7 @@ SELDOM static void expose_at(const uint16_t exposure_cycles[HAL_CHANNELS])
 SELDOM static void expose_again(void)
 {
     uint16_t cycles[HAL_CHANNELS];
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        cycles[i] = app.expose.led[i].exposure_cycles;
+    app_exposures(cycles);
     expose_at(cycles);
 }
 
@@ -147,12 +151,11 @@ SELDOM void app_expose_by(uint8_t op, const uint16_t exposure_us_q4[HAL_CHANNELS
     app_live_exposed(op == SG_EXPOSURE_SET);
 }
 
-// By a quarter or more: that waits for nothing.
-SELDOM static uint8_t far_from(const uint16_t cycles[HAL_CHANNELS])
+SELDOM uint8_t app_exposures_far(const uint16_t cycles[HAL_CHANNELS], uint8_t shift)
 {
     for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
         const uint16_t wish = app.expose.led[i].exposure_cycles;
-        if ((wish < cycles[i] ? cycles[i] - wish : wish - cycles[i]) > cycles[i] >> 2)
+        if ((wish < cycles[i] ? cycles[i] - wish : wish - cycles[i]) > cycles[i] >> shift)
             return 1;
     }
     return 0;
@@ -220,7 +223,8 @@ void app_sense_cycle(const struct hal_cycle *cycle)
     if (health)
         look_at(reading);
     else if (app.exposure_auto && sg_expose_cycle(&app.expose, reading, timing.wiring)) {
-        if (far_from(reading->exposure_cycles))
+        // A quarter waits for nothing.
+        if (app_exposures_far(reading->exposure_cycles, 2))
             wished = EXPOSE_CYCLES;
         else if (!wished)
             wished = 1;
