@@ -112,12 +112,13 @@ def test_frames_within_31_ms_after_one_out_of_range_are_recovering_and_not_valid
     assert sum(out) > 20 and last < 100
     moving = lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_EXPOSURE
     steps = [frame.t_us >> 8 for frame in frames]       # 256 us: what the device counts in
-    held, since = [], None              # frames that start the hold: out of range for 11 ms, in settled light
+    # What a frame out of range in settled light holds back: two frames, and 31 ms once that has lasted for 11.
+    holds, since = [], None
     for frame, before, step, was_out in zip(frames, [steps[0] - 99, *steps], steps, out):
         since = None if not was_out or frame.raw.flags & moving else before if since is None else since
-        held.append(since is not None and step - since >= 43)
+        holds.append(0 if since is None else 122 if step - since >= 43 else 9)
     for k, frame in enumerate(frames):
-        recovering = any(holds and steps[k] - before < 122 for holds, before in zip(held[:k], steps[:k]))
+        recovering = any(steps[k] - before < hold for hold, before in zip(holds[:k], steps[:k]))
         assert bool(frame.raw.flags & lib.SG_FLAG_RECOVERING) == recovering
         assert bool(frame.gaze.flags & lib.SG_FLAG_RECOVERING) == recovering
         refused = recovering or out[k] or frame.raw.flags & (moving | lib.SG_FLAG_FAULT)
