@@ -180,9 +180,12 @@ def test_a_step_of_a_thousand_in_the_middle_of_an_exposure(worn, repeats, least,
 
 @pytest.mark.parametrize("rate_hz, repeats, hz, times", [
     (0, 1, 100.0, 1.4), (0, 1, 120.0, 1.4), (0, 1, 100.1, 1.4), (500, 1, 100.0, 1.5), (250, 1, 120.0, 1.5),
-    (250, 4, 120.0, 1.2), (250, 4, 100.0, 1.2), (100, 1, 101.0, 1.5), (100, 4, 100.3, 1.5), (60, 1, 120.5, 1.5)])
+    (250, 4, 120.0, 1.5), (250, 4, 100.0, 1.5), (100, 1, 101.0, 1.5), (100, 4, 100.3, 1.5), (60, 1, 120.5, 1.5)])
 def test_flicker_and_its_beat_with_the_frame_rate(worn, rate_hz, repeats, hz, times):
-    """50 % deep, of the signal's size, against the same light that does not flicker; rate 0: the full one."""
+    """50 % deep, of the signal's size, against the same light that does not flicker; rate 0: the full one.
+
+    One gaze, whose error is mostly noise, which grows with the exposures that crests shorten. What flicker adds to the
+    error anywhere in the field is a figure of tools/bench/bench_frontend.py, flicker_ratio."""
     one = worn()
     one.device.settings(rate_hz=rate_hz, repeats=repeats)
     one.control.ambient(200.0)
