@@ -134,6 +134,7 @@ SELDOM void app_request(const struct sg_head *head, uint8_t n, uint32_t arrived_
     int8_t result = SG_OK;
     uint8_t answered = 0;               // later, by who does it
     const int8_t least = shortest(head->type);
+    const uint8_t mode = app_body.bytes[offsetof(struct sg_mode, mode)];    // if it is a request that has one
 
     if (least < 0 || n < (uint8_t)least) {
         refuse(head->type, head->seq, least < 0 ? SG_E_UNKNOWN : SG_E_SHORT);
@@ -154,12 +155,12 @@ SELDOM void app_request(const struct sg_head *head, uint8_t n, uint32_t arrived_
         answer_bytes = sizeof app_body.pong;
         break;
     case SG_MSG_MODE:
-        if (app_body.mode.mode & ~STREAM_ALL)
+        if (mode & ~STREAM_ALL)
             result = SG_E_ARG;
-        else if (app.stream != app_body.mode.mode) {
-            app.stream_kept = app.stream & app_body.mode.mode;
+        else if (app.stream != mode) {
+            app.stream_kept = app.stream & mode;
             app.settling = SETTLING_CYCLES;
-            app.stream = app_body.mode.mode;
+            app.stream = mode;
             app_rate_renew();
         }
         answer_bytes = sizeof app_body.mode;
@@ -187,9 +188,9 @@ SELDOM void app_request(const struct sg_head *head, uint8_t n, uint32_t arrived_
         answer_bytes = sizeof app_body.at;
         break;
     case SG_MSG_TRIAL_USE:
-        if (app_body.mode.mode > 1)
+        if (mode > 1)
             result = SG_E_ARG;
-        else if (app_body.mode.mode == 1) {
+        else if (mode == 1) {
             result = app_trial_use(head->seq);
             answered = 1;
         } else {
@@ -210,7 +211,7 @@ SELDOM void app_request(const struct sg_head *head, uint8_t n, uint32_t arrived_
         answer_bytes = sizeof app_body.curve;
         break;
     case SG_MSG_PROBE:
-        result = app_probe(app_body.mode.mode, head->seq);
+        result = app_probe(mode, head->seq);
         answered = 1;
         break;
     case SG_MSG_RECENTRE:
@@ -218,11 +219,11 @@ SELDOM void app_request(const struct sg_head *head, uint8_t n, uint32_t arrived_
         answer_bytes = sizeof app_body.recentre;
         break;
     case SG_MSG_REBOOT:
-        result = app_body.mode.mode == REBOOT_KEY ? SG_OK : SG_E_ARG;
+        result = mode == REBOOT_KEY ? SG_OK : SG_E_ARG;
         answer_bytes = sizeof app_body.mode;
         break;
     case SG_MSG_BAUD:
-        result = app_body.mode.mode <= 1 ? SG_OK : SG_E_ARG;
+        result = mode <= 1 ? SG_OK : SG_E_ARG;
         answer_bytes = sizeof app_body.mode;
         break;
     }
@@ -234,13 +235,15 @@ SELDOM void app_request(const struct sg_head *head, uint8_t n, uint32_t arrived_
     if (answered)
         return;
     app_send(head->type | SG_REPLY, head->seq, app_body.bytes, answer_bytes, 0);
+    uint8_t after = mode;               // enum hal_after
     if (head->type == SG_MSG_REBOOT) {
         app_live_flush();
-        hal_after_sending(HAL_AFTER_REBOOT);
-    }
-    if (head->type == SG_MSG_BAUD) {
-        app.slow_line = app_body.mode.mode;
+        after = HAL_AFTER_REBOOT;
+    } else if (head->type == SG_MSG_BAUD) {
+        app.slow_line = mode;
         app_rate_renew();
-        hal_after_sending(app.slow_line ? HAL_AFTER_BAUD_500K : HAL_AFTER_BAUD_1M);
+    } else {
+        return;
     }
+    hal_after_sending(after);
 }

@@ -287,7 +287,7 @@ void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS])
     plan_new = 1;
 }
 
-SELDOM void hal_set_timing(struct hal_timing *t)
+SELDOM __attribute__((noclone)) void hal_set_timing(struct hal_timing *t)
 {
     if (t->repeats < 1)
         t->repeats = 1;
@@ -296,25 +296,22 @@ SELDOM void hal_set_timing(struct hal_timing *t)
     uint16_t n = SLOT_CYCLES_MIN;
     for (uint16_t left = t->period_cycles; left >= SLOTS * (SLOT_CYCLES_MIN + 1) && n < SLOT_CYCLES_MAX; n++)
         left -= SLOTS;
-    __uint24 pause = t->frame_cycles > PAUSE_MOST ? PAUSE_MOST : (__uint24)t->frame_cycles;
-    for (uint8_t k = t->repeats; k != 0; k--)
-        pause = pause > SLOTS * n ? pause - SLOTS * n : 0;
+    if (t->frame_cycles > PAUSE_MOST)
+        t->frame_cycles = PAUSE_MOST;
     const uint16_t step = SLOTS * t->repeats;
-    if (pause < step)
+    int32_t pause = (int32_t)(t->frame_cycles - (uint32_t)n * step);
+    if (pause < (int16_t)step) {
         pause = 0;
-    // A pause too short to make: shorter cycles, a longer pause.
-    while (pause && pause < PAUSE_LEAST_SLOTS * n) {
-        n--;
-        pause += step;
+        t->frame_cycles = 0;
+    } else {
+        // A pause too short to make: shorter cycles, a longer pause.
+        for (; pause < (int16_t)(PAUSE_LEAST_SLOTS * n); pause += step)
+            n--;
     }
     t->period_cycles = SLOTS * n;
-    if (!pause)
-        t->frame_cycles = 0;
-    else if (t->frame_cycles > PAUSE_MOST)
-        t->frame_cycles = PAUSE_MOST;
     timing = *t;
     slot = n;
-    pause_new = pause;
+    pause_new = (__uint24)pause;
     plan_clip(exposure, t->wiring, n);
     timing_new = 1;
     plan_new = 1;
