@@ -71,11 +71,12 @@ static uint8_t optical(const struct sg_health_sight *sight)
 {
     if (sight->gain_q12 == 0)
         return 0;
-    if ((int32_t)sight->feature + OCTAVE < (int32_t)sight->offset)
-        return SG_HEALTH_LOW;
-    if ((int32_t)sight->feature - ABOVE < (int32_t)sight->offset)
+    if (sight->feature < sight->offset)
+        return (uint16_t)(sight->offset - sight->feature) > OCTAVE ? SG_HEALTH_LOW : 0;
+    const uint16_t past = (uint16_t)(sight->feature - sight->offset);
+    if (past < ABOVE)
         return 0;
-    const uint32_t above = (uint32_t)(sight->feature - sight->offset - ABOVE) * sight->gain_q12;
+    const uint32_t above = (uint32_t)(uint16_t)(past - ABOVE) * sight->gain_q12;
     return above >> 12 >= MIDDLE_STEPS ? SG_HEALTH_HIGH : 0;
 }
 

@@ -9,6 +9,8 @@
 #define HEAD(field) (offsetof(struct sg_model_head, field))
 #define TRUST(field) (SG_MODEL_PAGE + offsetof(struct sg_model_trust, field))
 #define GUARD(field) (offsetof(struct sg_model_guard, field))
+_Static_assert(HEAD(offset) == HEAD(trend) + 24 && HEAD(gain_q12) == HEAD(offset) + 12
+               && HEAD(version) == HEAD(gain_q12) + 12, "model layout");
 #define CRC_FROM 8U              // the CRC covers what follows it
 
 // What runs when a model is checked and never for a frame: compiled for size.
@@ -41,17 +43,17 @@ SELDOM uint32_t sg_model_crc32(uint32_t crc, const uint8_t *data, size_t n)
     return ~crc;
 }
 
-// Bytes of the grid, or SG_E_BOUNDS.
-SELDOM static int grid_bytes(const uint8_t *image, uint8_t space)
+// Bytes of the grid, 0 if there cannot be one.
+SELDOM static uint16_t grid_bytes(const uint8_t *image, uint8_t space)
 {
     const uint8_t wide = sg_rom_byte(image + TRUST(nodes), space);
     const uint8_t high = sg_rom_byte(image + TRUST(nodes) + 1, space);
     if (wide < 2 || wide > SG_MODEL_NODES_MAX || high < 2 || high > SG_MODEL_NODES_MAX)
-        return SG_E_BOUNDS;
-    return (int)((uint16_t)((uint16_t)wide * high) * SG_MODEL_NODE_BYTES);
+        return 0;
+    return (uint16_t)((uint16_t)((uint16_t)wide * high) * SG_MODEL_NODE_BYTES);
 }
 
-SELDOM int sg_model_length(const uint8_t *image, uint32_t room, uint8_t space)
+SELDOM int sg_model_length(const uint8_t *image, uint16_t room, uint8_t space)
 {
     if (room < SG_MODEL_HEAD_BYTES)
         return SG_E_SHORT;
@@ -60,13 +62,14 @@ SELDOM int sg_model_length(const uint8_t *image, uint32_t room, uint8_t space)
     if (sg_rom_u16(image + HEAD(version), space) != (uint16_t)SG_MODEL_VERSION)
         return SG_E_VERSION;
     const uint8_t vectors = sg_rom_byte(image + HEAD(vectors), space);
-    const int grid = grid_bytes(image, space);
-    if (vectors < 1 || vectors > SG_MODEL_VECTORS_MAX || grid < 0)
+    const uint16_t grid = grid_bytes(image, space);
+    if (vectors < 1 || vectors > SG_MODEL_VECTORS_MAX || grid == 0)
         return SG_E_BOUNDS;
     // at most 256 + 2880 + 234 * 12: 16 bits
     const uint16_t records = (uint16_t)((uint16_t)vectors * SG_MODEL_RECORD_BYTES);
-    const uint16_t length = (uint16_t)(SG_MODEL_HEAD_BYTES + (uint16_t)grid + records);
-    if (length > SG_MODEL_SLOT_BYTES || sg_rom_u32(image + HEAD(length), space) != length)
+    const uint16_t length = (uint16_t)(SG_MODEL_HEAD_BYTES + grid + records);
+    if (length > SG_MODEL_SLOT_BYTES || sg_rom_u16(image + HEAD(length), space) != length
+        || sg_rom_u16(image + HEAD(length) + 2, space) != 0)
         return SG_E_BOUNDS;
     if (length > room)
         return SG_E_SHORT;
@@ -82,13 +85,14 @@ SELDOM static uint8_t any_bit(const uint8_t *data, uint8_t n, uint8_t space)
     return bits;
 }
 
-// Fields of channels >= d that are not 0.
+// Fields of channels >= d that are not 0: of the trends, the offsets and the gains, which lie in a row.
 SELDOM static uint8_t unused_channel_bits(const uint8_t *image, uint8_t channels, uint8_t space)
 {
-    const uint8_t unused = (uint8_t)(2U * (SG_MODEL_CHANNELS - channels));
-    const uint8_t *first = image + 2U * channels;
-    return any_bit(first + HEAD(offset), unused, space) | any_bit(first + HEAD(gain_q12), unused, space)
-           | any_bit(first + HEAD(trend[0]), unused, space) | any_bit(first + HEAD(trend[1]), unused, space);
+    const uint8_t used = (uint8_t)(channels << 1);
+    uint8_t bits = 0;
+    for (uint8_t at = HEAD(trend); at < HEAD(version); at = (uint8_t)(at + 2 * SG_MODEL_CHANNELS))
+        bits |= any_bit(image + (uint8_t)(at + used), (uint8_t)(2 * SG_MODEL_CHANNELS - used), space);
+    return bits;
 }
 
 // Two's complement of 16 bits between two limits.
@@ -116,13 +120,13 @@ SELDOM static int check_guards(const uint8_t *image, uint8_t guards, uint8_t cha
             return SG_E_BOUNDS;
         if (!within(sg_rom_u16(guard + GUARD(base), space), -14336, 14336))
             return SG_E_BOUNDS;
-        uint16_t size = 0;
+        uint8_t size = 0;
         for (uint8_t j = 0; j < SG_MODEL_CHANNELS; j++) {
             const uint8_t entry = sg_rom_byte(guard + GUARD(row) + j, space);
-            size = (uint16_t)(size + (entry < 128 ? entry : 256U - entry));
+            size = (uint8_t)(size + (entry < 128 ? entry : (uint8_t)-entry));   // at most 63 + 128
+            if (size > 63)
+                return SG_E_BOUNDS;
         }
-        if (size > 63)
-            return SG_E_BOUNDS;
         if (any_bit(guard + GUARD(row) + channels, (uint8_t)(SG_MODEL_CHANNELS - channels), space))
             return SG_E_BOUNDS;
     }
@@ -155,7 +159,7 @@ SELDOM static int check_record(const uint8_t *record, uint8_t channels, uint8_t 
 
 SELDOM uint16_t sg_model_part(const uint8_t *image, uint16_t at, uint8_t space)
 {
-    const uint16_t records = (uint16_t)(SG_MODEL_HEAD_BYTES + (uint16_t)grid_bytes(image, space));
+    const uint16_t records = (uint16_t)(SG_MODEL_HEAD_BYTES + grid_bytes(image, space));
     if (at < SG_MODEL_HEAD_BYTES)
         return SG_MODEL_HEAD_BYTES;
     return (uint16_t)(at + (at < records ? SG_MODEL_NODE_BYTES : SG_MODEL_RECORD_BYTES));
@@ -163,7 +167,7 @@ SELDOM uint16_t sg_model_part(const uint8_t *image, uint16_t at, uint8_t space)
 
 SELDOM int sg_model_check_part(const uint8_t *image, uint16_t at, uint8_t space)
 {
-    const uint16_t records = (uint16_t)(SG_MODEL_HEAD_BYTES + (uint16_t)grid_bytes(image, space));
+    const uint16_t records = (uint16_t)(SG_MODEL_HEAD_BYTES + grid_bytes(image, space));
     const uint8_t *part = image + at;
     if (at < records) {
         const uint8_t guards = sg_rom_byte(image + TRUST(guards), space);
@@ -174,8 +178,8 @@ SELDOM int sg_model_check_part(const uint8_t *image, uint16_t at, uint8_t space)
     return check_record(part, sg_rom_byte(image + HEAD(channels), space), space);
 }
 
-SELDOM int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space,
-                          uint32_t crc, int parts)
+SELDOM int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint16_t room, uint8_t space,
+                                 uint32_t crc, int parts)
 {
     const int length = sg_model_length(image, room, space);
     if (length < 0)
@@ -186,8 +190,7 @@ SELDOM int sg_model_open_checked(struct sg_model_view *view, const uint8_t *imag
     const uint8_t channels = sg_rom_byte(image + HEAD(channels), space);
     const uint8_t weight_frac_bits = sg_rom_byte(image + HEAD(weight_frac_bits), space);
     const uint8_t guards = sg_rom_byte(image + TRUST(guards), space);
-    const uint16_t grid = (uint16_t)grid_bytes(image, space);   // sg_model_length has found it good
-    const uint16_t records = (uint16_t)(SG_MODEL_HEAD_BYTES + grid);
+    const uint16_t records = (uint16_t)(SG_MODEL_HEAD_BYTES + grid_bytes(image, space));
     if (channels < 1 || channels > SG_MODEL_CHANNELS || guards > SG_MODEL_GUARDS)
         return SG_E_BOUNDS;
     if (weight_frac_bits < 5 || weight_frac_bits > 9)
@@ -222,7 +225,8 @@ SELDOM int sg_model_open_checked(struct sg_model_view *view, const uint8_t *imag
 
 SELDOM int sg_model_open(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space)
 {
-    const int length = sg_model_length(image, room, space);
+    const uint16_t most = room > SG_MODEL_SLOT_BYTES ? (uint16_t)SG_MODEL_SLOT_BYTES : (uint16_t)room;
+    const int length = sg_model_length(image, most, space);
     if (length < 0)
         return length;
     const uint32_t crc = sg_model_crc32_at(0, image + CRC_FROM, (uint16_t)(length - (int)CRC_FROM), space);
@@ -230,5 +234,5 @@ SELDOM int sg_model_open(struct sg_model_view *view, const uint8_t *image, uint3
     for (uint16_t at = SG_MODEL_HEAD_BYTES; at < (uint16_t)length && parts == SG_OK;
          at = sg_model_part(image, at, space))
         parts = sg_model_check_part(image, at, space);
-    return sg_model_open_checked(view, image, room, space, crc, parts);
+    return sg_model_open_checked(view, image, most, space, crc, parts);
 }

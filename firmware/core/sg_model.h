@@ -136,7 +136,7 @@ int sg_model_open(struct sg_model_view *view, const uint8_t *image, uint32_t roo
 
 // The same for a caller that has gone over the image in pieces: crc is that of bytes [8, length), `parts` the first
 // error of sg_model_check_part, or SG_OK.
-int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint32_t room, uint8_t space,
+int sg_model_open_checked(struct sg_model_view *view, const uint8_t *image, uint16_t room, uint8_t space,
                           uint32_t crc, int parts);
 
 // The nodes and records of an image one by one, from byte SG_MODEL_HEAD_BYTES to its length, which
@@ -148,7 +148,7 @@ int sg_model_check_part(const uint8_t *image, uint16_t at, uint8_t space);
 // The length an image claims, for a caller that computes the CRC in pieces: header checks up to SG_E_SHORT as
 // above.
 // Returns the length in bytes, 288..3072, or the error.
-int sg_model_length(const uint8_t *image, uint32_t room, uint8_t space);
+int sg_model_length(const uint8_t *image, uint16_t room, uint8_t space);
 // cdef end
 
 _Static_assert(sizeof(struct sg_model_head) == SG_MODEL_PAGE, "model layout");

@@ -6,6 +6,7 @@
 #include "port.h"
 
 #include <avr/eeprom.h>
+#include <string.h>
 
 enum {
     TAIL_BYTES = 4,
@@ -31,39 +32,37 @@ static uint16_t place(uint8_t which, uint8_t n)
     return (n == SIZE_V1 ? 0 : n == SIZE_V2 ? PLACE_V2 : PLACE_V3) + (which ? copy_bytes : 0);
 }
 
-// 1 if the copy is whole; *found is then its sequence number.
-static uint8_t check_copy(uint16_t at, uint8_t n, uint16_t *found)
+// Of a record and of the sequence number in `tail`.
+static __attribute__((noinline)) uint16_t record_crc(const uint8_t *record, uint8_t n)
 {
-    uint16_t crc = 0xFFFF;
-    for (uint8_t i = 0; i < n + 2; i++) {
-        const uint8_t byte = eeprom_read_byte((const uint8_t *)(at + i));
-        crc = sg_wire_crc16(crc, &byte, 1);
-    }
-    *found = eeprom_read_word((const uint16_t *)(at + n));
-    return eeprom_read_word((const uint16_t *)(at + n + 2)) == crc;
+    return sg_wire_crc16(sg_wire_crc16(0xFFFF, record, n), (const uint8_t *)&tail.sequence,
+                         sizeof tail.sequence);
 }
 
 uint8_t hal_load(void *record, uint8_t n)
 {
-    uint16_t found[2];
-    const uint8_t whole_a = check_copy(place(0, n), n, &found[0]);
-    const uint8_t whole_b = check_copy(place(1, n), n, &found[1]);
-    uint8_t newest = 0;
-    if (!whole_a && !whole_b)
-        return 0;
-    if (whole_b && (!whole_a || (int16_t)(found[1] - found[0]) > 0))
-        newest = 1;
-    sequence = found[newest];
-    eeprom_read_block(record, (const uint8_t *)place(newest, n), n);
-    copy = !newest;
-    return 1;
+    uint8_t any = 0;
+    for (uint8_t which = 0; which < 2; which++) {
+        uint8_t bytes[HAL_RECORD_MAX];
+        const uint16_t at = place(which, n);
+        eeprom_read_block(bytes, (const uint8_t *)at, n);
+        eeprom_read_block(&tail, (const uint8_t *)(at + n), TAIL_BYTES);
+        if (record_crc(bytes, n) != tail.crc)
+            continue;
+        if (any && (int16_t)(tail.sequence - sequence) <= 0)
+            continue;
+        any = 1;
+        sequence = tail.sequence;
+        copy = !which;
+        memcpy(record, bytes, n);
+    }
+    return any;
 }
 
 uint8_t hal_save(const void *record, uint8_t n)
 {
     tail.sequence = sequence + 1;
-    tail.crc = sg_wire_crc16(sg_wire_crc16(0xFFFF, record, n), (const uint8_t *)&tail.sequence,
-                             sizeof tail.sequence);
+    tail.crc = record_crc(record, n);
     payload = record;
     payload_bytes = n;
     position = 0;
