@@ -101,17 +101,21 @@ SELDOM static int8_t begin(uint8_t type, uint8_t slot, uint16_t seq)
 
 SELDOM void app_models_start(void)
 {
-    for (uint8_t slot = SG_SLOT_A; slot <= SG_SLOT_B; slot++) {
-        verdict[slot] = SG_E_MAGIC;
-        if (begin(0, slot, 0) != SG_OK)
-            continue;
-        while (check.at < check.length)
-            step();
-        verdict[slot] = judge(&view[slot]);
-        check.at = 0;
-        if (verdict[slot] == SG_OK
-            && (stored == SG_SLOT_NONE || (int32_t)(view[slot].generation - view[stored].generation) > 0))
-            stored = slot;
+    struct sg_model_view *found = view;
+    const struct sg_model_view *newest = NULL;
+    for (uint8_t slot = SG_SLOT_A; slot <= SG_SLOT_B; slot++, found++) {
+        int8_t result = SG_E_MAGIC;
+        if (begin(0, slot, 0) == SG_OK) {
+            while (check.at < check.length)
+                step();
+            result = judge(found);
+            check.at = 0;
+            if (result == SG_OK && (!newest || (int32_t)(found->generation - newest->generation) > 0)) {
+                newest = found;
+                stored = slot;
+            }
+        }
+        verdict[slot] = result;
     }
     forget_trial(SG_E_MAGIC);
     active = stored;
