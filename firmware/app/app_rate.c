@@ -30,6 +30,12 @@ enum {
     PACKET_BYTES = SG_WIRE_FRAME_MAX - SG_WIRE_BODY_MAX,
 };
 
+// Whole microseconds of so many cycles. One place, because a shift is a loop.
+SELDOM static uint16_t us_of(uint16_t cycles)
+{
+    return cycles / CYCLES_PER_US;
+}
+
 // 10^6 / n, by subtraction: this chip does not divide, and nobody waits. n at least 16.
 SELDOM static uint16_t million_over(uint16_t n)
 {
@@ -61,7 +67,7 @@ SELDOM static uint8_t stream_bytes(void)
 SELDOM static uint16_t infer_us(void)
 {
     const struct sg_model_view *model = app_model();
-    return model ? ((uint16_t)COST_MODEL + (uint16_t)COST_VECTOR * model->vectors) / CYCLES_PER_US + 1 : 0;
+    return model ? us_of((uint16_t)COST_MODEL + (uint16_t)COST_VECTOR * model->vectors) + 1 : 0;
 }
 
 // Between the last readings of a frame and the end of all work that this brings, interrupts included.
@@ -76,7 +82,7 @@ SELDOM static uint16_t work_us(void)
         cycles += COST_RAW;
     if (app.stream & SG_STREAM_COUNTS)
         cycles += COST_COUNTS;
-    return cycles / CYCLES_PER_US + 1 + infer_us();
+    return us_of(cycles) + 1 + infer_us();
 }
 
 // n * by; at most 16 * 1998 and no frame's time more.
@@ -97,8 +103,11 @@ SELDOM static uint16_t shortest(uint16_t *period_us)
     *period_us = period;
     const uint16_t frame = times(period, app_live.repeats - 1) + last;
     // The line needs its time as well, and answers an eighth of it.
-    const uint16_t line = (uint16_t)(stream_bytes() * BYTE_US) << (app.slow_line ? 1 : 0);
-    return frame < line + (line >> 3) ? line + (line >> 3) : frame;
+    uint16_t line = stream_bytes() * BYTE_US;
+    if (app.slow_line)
+        line <<= 1;
+    line += line >> 3;
+    return frame < line ? line : frame;
 }
 
 // The timing wanted.
@@ -112,16 +121,19 @@ SELDOM void app_rate_start(struct hal_timing *timing)
             frame = wanted;
     }
     // Cycles without a gap follow ambient light that flickers: as many as there is time for, then longer ones.
+    uint16_t sensing = times(period, repeats);
     if (app_live.power == SG_POWER_NORMAL) {
-        while (repeats < SG_LIGHT_REPEATS_MAX && times(period, repeats + 1) <= frame)
+        for (; repeats < SG_LIGHT_REPEATS_MAX && sensing + period <= frame; sensing += period)
             repeats++;
-        while (period < PERIOD_MOST_US && times(period + 1, repeats) <= frame)
+        for (; period < PERIOD_MOST_US && sensing + repeats <= frame; sensing += repeats)
             period++;
     }
-    const uint16_t dark = frame - times(period, repeats);
+    uint16_t dark = frame - sensing;
     app.pause = dark > (uint16_t)(PAUSE_US + repeats);
-    if (!app.pause)
-        frame -= dark;
+    if (!app.pause) {
+        frame = sensing;
+        dark = 0;
+    }
     memset(timing, 0, sizeof *timing);
     timing->period_cycles = period * CYCLES_PER_US;
     timing->frame_cycles = (uint32_t)frame * CYCLES_PER_US;
@@ -131,11 +143,12 @@ SELDOM void app_rate_start(struct hal_timing *timing)
     timing->probe = app.probe;
     timing->sleep = app_live.power == SG_POWER_LOW;
     // What is left of the time until the next frame's first cycle is complete.
-    const uint16_t spare = frame - times(period, repeats) + period - work_us();
+    dark += period;
+    const uint16_t spare = app.sensed ? dark - work_us() : UINT16_MAX;
     // The last sample takes a slot of 18 to arrive.
-    app.busy_us = period + (app.pause ? dark : 0) + (period >> 4) - 6 + COST_REQUEST / CYCLES_PER_US;
-    app.infer_fits = !app.sensed || spare >= infer_us();
-    app.roomy = !app.sensed || spare >= ROOMY_US;
+    app.busy_us = dark + us_of(period) - 6 + COST_REQUEST / CYCLES_PER_US;
+    app.infer_fits = spare >= infer_us();
+    app.roomy = spare >= ROOMY_US;
 }
 
 SELDOM void app_rate_renew(void)
@@ -149,7 +162,7 @@ uint16_t app_frame_us(void)
 {
     const struct hal_timing *timing = app_timing();
     if (!timing->frame_cycles)
-        return times(timing->period_cycles / CYCLES_PER_US, timing->repeats);
+        return times(us_of(timing->period_cycles), timing->repeats);
     return (uint16_t)(timing->frame_cycles / CYCLES_PER_US);
 }
 
@@ -158,10 +171,11 @@ SELDOM __attribute__((noclone)) int8_t app_settings(struct sg_settings *io)
     if (io->op > SG_SETTINGS_SET)
         return SG_E_ARG;
     if (io->op == SG_SETTINGS_SET) {
+        const uint8_t less = (uint8_t)(io->repeats - 1);    // 255: none
         // Frames of more than 65 ms do not fit their field; a gaze after every pair does not fit its time.
         if ((io->rate_hz && io->rate_hz < SG_WIRE_RATE_LEAST_HZ) || io->wiring > SG_WIRING_PHOTODIODES
-            || io->power > SG_POWER_LOW || io->rolling || io->lights > 1 || !io->repeats
-            || io->repeats > SG_LIGHT_REPEATS_MAX || (io->repeats & (io->repeats - 1)))
+            || io->power > SG_POWER_LOW || io->rolling || io->lights > 1 || less >= SG_LIGHT_REPEATS_MAX
+            || (io->repeats & less))
             return SG_E_ARG;
         app_live.rate_hz = io->rate_hz;
         app_live.repeats = io->repeats;
@@ -174,7 +188,7 @@ SELDOM __attribute__((noclone)) int8_t app_settings(struct sg_settings *io)
     io->frame_period_us = app_frame_us();
     io->rate_hz = million_over(io->frame_period_us);
     io->rate_limit_hz = million_over(shortest(&io->period_us));
-    io->period_us = app_timing()->period_cycles / CYCLES_PER_US;
+    io->period_us = us_of(app_timing()->period_cycles);
     io->repeats = app_live.repeats;
     io->wiring = app_live.wiring;
     io->power = app_live.power;
