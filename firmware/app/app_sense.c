@@ -92,7 +92,7 @@ SELDOM static void light_again(void)
     sg_light_curve(&app.light, app_live.curve_q10, app_live.zero_q2);
 }
 
-static uint16_t mark_of(const struct hal_timing *t)
+SELDOM static uint16_t mark_of(const struct hal_timing *t)
 {
     return sg_wire_crc16(0xFFFF, (const uint8_t *)t, sizeof *t);
 }
@@ -131,23 +131,16 @@ const struct hal_timing *app_timing(void)
 SELDOM void app_expose_by(uint8_t op, const uint16_t exposure_us_q4[HAL_CHANNELS])
 {
     uint16_t cycles[HAL_CHANNELS];
+    uint16_t *const to = op == SG_EXPOSURE_LIMIT ? app_live.limit_cycles : cycles;
     if (op == SG_EXPOSURE_GET)
         return;
     for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        cycles[i] = sg_expose_from_us_q4(exposure_us_q4[i]);
-    switch (op) {
-    case SG_EXPOSURE_SET:
-        app.exposure_auto = 0;
-        expose_at(cycles);
-        break;
-    case SG_EXPOSURE_LIMIT:
-        memcpy(app_live.limit_cycles, cycles, sizeof cycles);
-        expose_again();
-        break;
-    default:
+        to[i] = sg_expose_from_us_q4(exposure_us_q4[i]);
+    if (op != SG_EXPOSURE_LIMIT)
         app.exposure_auto = op == SG_EXPOSURE_AUTO;
-        expose_again();
-    }
+    if (op != SG_EXPOSURE_SET)
+        app_exposures(cycles);
+    expose_at(cycles);
     app_live_exposed(op == SG_EXPOSURE_SET);
 }
 
