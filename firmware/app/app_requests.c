@@ -53,7 +53,7 @@ SELDOM static int8_t shortest(uint8_t type)
     }
 }
 
-SELDOM static void status(struct sg_status *out)
+SELDOM __attribute__((noclone)) static void status(struct sg_status *out)
 {
     *out = app.status;
     hal_report(out);
@@ -128,7 +128,7 @@ SELDOM static int8_t trial_write(uint8_t n)
 }
 
 // `body` holds the n bytes of the request, and then its answer.
-SELDOM void app_request(const struct sg_head *head, uint8_t n, uint32_t arrived_us)
+SELDOM __attribute__((noclone)) void app_request(const struct sg_head *head, uint8_t n, uint32_t arrived_us)
 {
     uint8_t answer_bytes = 0;
     int8_t result = SG_OK;

@@ -287,6 +287,14 @@ void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS])
     plan_new = 1;
 }
 
+// All lists anew, at once.
+SELDOM static void write_whole(void)
+{
+    plan_new = 1;
+    plan_hurry = HURRY_WHOLE;
+    written = 0;
+}
+
 SELDOM __attribute__((noclone)) void hal_set_timing(struct hal_timing *t)
 {
     if (t->repeats < 1)
@@ -314,9 +322,7 @@ SELDOM __attribute__((noclone)) void hal_set_timing(struct hal_timing *t)
     pause_new = (__uint24)pause;
     plan_clip(exposure, t->wiring, n);
     timing_new = 1;
-    plan_new = 1;
-    plan_hurry = HURRY_WHOLE;
-    written = 0;
+    write_whole();
 }
 
 // One list of the plan that is not in use, and when all are written it is the next. Returns 1 if that took little
@@ -369,9 +375,7 @@ void sense_poll(void)
 {
     if (locked_out && sense_wraps >= LOCKOUT_WRAPS) {
         locked_out = 0;
-        plan_new = 1;
-        plan_hurry = HURRY_WHOLE;
-        written = 0;
+        write_whole();
     }
     // The other plan is free when neither the running cycle nor the newest complete one follows it.
     if ((plan_new || written) && sense_current == plan_next && filling()->other->plan == plan_next
