@@ -39,10 +39,10 @@ SELDOM static uint16_t us_of(uint16_t cycles)
 // 10^6 / n, by subtraction: this chip does not divide, and nobody waits. n at least 16.
 SELDOM static uint16_t million_over(uint16_t n)
 {
-    uint32_t rest = 1000000UL;
+    uint32_t rest = 1000000UL, part = (uint32_t)n << 16;
     uint16_t quotient = 0;
-    for (uint8_t bit = 16; bit-- != 0;) {
-        const uint32_t part = (uint32_t)n << bit;
+    for (uint8_t bit = 16; bit != 0; bit--) {
+        part >>= 1;
         quotient <<= 1;
         if (rest >= part) {
             rest -= part;
@@ -141,7 +141,7 @@ SELDOM void app_rate_start(struct hal_timing *timing)
     timing->wiring = app_live.wiring;
     timing->lights = app_live.lights;
     timing->probe = app.probe;
-    timing->sleep = app_live.power == SG_POWER_LOW;
+    timing->sleep = app_live.power;     // enum sg_power: 1 is low
     // What is left of the time until the next frame's first cycle is complete.
     dark += period;
     const uint16_t spare = app.sensed ? dark - work_us() : UINT16_MAX;
