@@ -151,6 +151,7 @@ uint8_t app_models_finish(void);
 // app_live.c
 void app_live_start(void);                                  // load, count the boot
 const struct sg_affine *app_recentre(void);                 // in force for the model in use; NULL: none
+void app_recentre_copy(struct sg_affine *to, const struct sg_affine *from);     // NULL: none, all 0
 void app_recentre_set(const struct sg_affine *affine);      // NULL: none
 void app_live_changed(void);
 // Exposures or what makes them were set: stored at once, or those that may be one of many once they rest.

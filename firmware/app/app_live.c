@@ -48,13 +48,19 @@ const struct sg_affine *app_recentre(void)
     return model && model->crc == app_live.model_crc ? &app_live.recentre : NULL;
 }
 
+NOT_KEPT void app_recentre_copy(struct sg_affine *to, const struct sg_affine *from)
+{
+    if (from)
+        *to = *from;
+    else
+        memset(to, 0, sizeof *to);
+}
+
 SELDOM void app_recentre_set(const struct sg_affine *affine)
 {
     const struct sg_model_view *model = app_model();
     app_live.model_crc = model && affine ? model->crc : 0;
-    memset(&app_live.recentre, 0, sizeof app_live.recentre);
-    if (affine)
-        app_live.recentre = *affine;
+    app_recentre_copy(&app_live.recentre, affine);
     dirty = 1;
     app_rate_renew();
 }

@@ -107,10 +107,7 @@ SELDOM static int8_t recentre(struct sg_recentre *io)
         app_recentre_set(&io->affine);
     else if (io->op == SG_RECENTRE_CLEAR)
         app_recentre_set(NULL);
-    const struct sg_affine *now = app_recentre();
-    memset(&io->affine, 0, sizeof io->affine);
-    if (now)
-        io->affine = *now;
+    app_recentre_copy(&io->affine, app_recentre());
     io->reserved = 0;
     return SG_OK;
 }

@@ -179,9 +179,7 @@ NOT_KEPT static void send_raw(struct sg_raw *raw, const struct sg_model_view *mo
     raw->model_crc = model ? model->crc : 0;
     memcpy(raw->feature, app.feature, sizeof raw->feature);
     raw->reserved = 0;
-    memset(&raw->recentre, 0, sizeof raw->recentre);
-    if (recentre)
-        raw->recentre = *recentre;
+    app_recentre_copy(&raw->recentre, recentre);
     send_stream(SG_MSG_RAW, raw, sizeof *raw);
 }
 

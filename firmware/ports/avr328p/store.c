@@ -22,6 +22,7 @@ static struct { uint16_t sequence, crc; } tail;
 _Static_assert(sizeof tail == TAIL_BYTES, "layout in EEPROM");
 static uint8_t payload_bytes;           // 0: nothing under way
 static uint8_t position;
+static uint16_t to;                     // in EEPROM
 static uint8_t copy;                    // where the next write goes
 static uint16_t sequence;               // of the newest whole copy
 static uint16_t writes;
@@ -66,6 +67,7 @@ uint8_t hal_save(const void *record, uint8_t n)
     payload = record;
     payload_bytes = n;
     position = 0;
+    to = place(copy, n);
     return 1;
 }
 
@@ -90,7 +92,7 @@ void store_poll(void)
         writes++;
         return;
     }
-    EEAR = place(copy, payload_bytes) + position;
+    EEAR = to + position;
     EECR = 1 << EERE;
     const uint8_t wanted = position < payload_bytes ? payload[position]
                                                     : ((const uint8_t *)&tail)[position - payload_bytes];
