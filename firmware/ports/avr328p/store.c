@@ -16,13 +16,12 @@ enum {
     PLACE_V3 = PLACE_V2 + 2 * (SIZE_V2 + TAIL_BYTES),
 };
 
-// Being written: the record where it lies, and its tail.
-static const uint8_t *payload;
+// Being written: the record where it lies, then its tail.
+static const uint8_t *from;
+static uint16_t to;                     // in EEPROM
 static struct { uint16_t sequence, crc; } tail;
 _Static_assert(sizeof tail == TAIL_BYTES, "layout in EEPROM");
-static uint8_t payload_bytes;           // 0: nothing under way
-static uint8_t position;
-static uint16_t to;                     // in EEPROM
+static uint8_t left;                    // bytes, and one for the end; 0: nothing under way
 static uint8_t copy;                    // where the next write goes
 static uint16_t sequence;               // of the newest whole copy
 static uint16_t writes;
@@ -64,16 +63,15 @@ uint8_t hal_save(const void *record, uint8_t n)
 {
     tail.sequence = sequence + 1;
     tail.crc = record_crc(record, n);
-    payload = record;
-    payload_bytes = n;
-    position = 0;
+    from = record;
+    left = n + TAIL_BYTES + 1;
     to = place(copy, n);
     return 1;
 }
 
 uint8_t store_busy(void)
 {
-    return payload_bytes;
+    return left;
 }
 
 uint16_t store_writes(void)
@@ -83,20 +81,19 @@ uint16_t store_writes(void)
 
 void store_poll(void)
 {
-    if (!payload_bytes || (EECR & (1 << EEPE)))
+    if (!left || (EECR & (1 << EEPE)))
         return;
-    if (position == payload_bytes + TAIL_BYTES) {
-        payload_bytes = 0;
-        copy = !copy;
+    if (--left == 0) {
+        copy ^= 1;
         sequence++;
         writes++;
         return;
     }
-    EEAR = to + position;
+    if (left == TAIL_BYTES)
+        from = (const uint8_t *)&tail;
+    EEAR = to++;
     EECR = 1 << EERE;
-    const uint8_t wanted = position < payload_bytes ? payload[position]
-                                                    : ((const uint8_t *)&tail)[position - payload_bytes];
-    position++;
+    const uint8_t wanted = *from++;
     if (EEDR == wanted)         // spare the cell, and 3.4 ms
         return;
     EEDR = wanted;
