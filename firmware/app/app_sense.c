@@ -16,6 +16,7 @@ enum {
     PROBE_BEFORE = 4,
     PROBE_SUM = SG_LIGHT_REPEATS_MAX,
     PROBE_AFTER = 4,
+    ALL_BITS = 15,              // of an exposure: nothing is left of one shifted by so many
 };
 
 static uint8_t wished;                  // cycles since exposures were chosen that are not asked for yet; 0: none
@@ -148,7 +149,9 @@ SELDOM uint8_t app_exposures_far(const uint16_t cycles[HAL_CHANNELS], uint8_t sh
 {
     for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
         const uint16_t wish = app.expose.led[i].exposure_cycles;
-        if ((wish < cycles[i] ? cycles[i] - wish : wish - cycles[i]) > cycles[i] >> shift)
+        // Mostly they are the same: then without the shift, a loop.
+        if (wish != cycles[i]
+            && (wish < cycles[i] ? cycles[i] - wish : wish - cycles[i]) > cycles[i] >> shift)
             return 1;
     }
     return 0;
@@ -170,14 +173,6 @@ void app_sense_step(void)
 static uint8_t first(uint8_t i)
 {
     return sg_rom_byte(&before[timing.wiring][i], SG_ROM_FLASH);
-}
-
-SELDOM static uint8_t exposures_are(const uint16_t cycles[HAL_CHANNELS])
-{
-    uint8_t same = 1;
-    for (uint8_t i = 0; i < HAL_CHANNELS; i++)
-        same &= app.expose.led[i].exposure_cycles == cycles[i];
-    return same;
 }
 
 static void look_at(const struct sg_reading *reading)
@@ -203,7 +198,7 @@ void app_sense_cycle(const struct hal_cycle *cycle)
     if (health) {
         look_at_alarms();
         // What the port makes is what counts, should it ever be something else than it said.
-        unlike = exposures_are(reading->exposure_cycles) ? 0 : unlike + 1;
+        unlike = app_exposures_far(reading->exposure_cycles, ALL_BITS) ? unlike + 1 : 0;
         if (unlike == UNLIKE_LOOKS) {
             sg_expose_taken(&app.expose, reading->exposure_cycles);
             unlike = 0;
