@@ -295,7 +295,8 @@ SELDOM static void write_whole(void)
     written = 0;
 }
 
-SELDOM __attribute__((noclone)) void hal_set_timing(struct hal_timing *t)
+SELDOM __attribute__((noclone))
+void hal_set_timing(struct hal_timing *t)
 {
     if (t->repeats < 1)
         t->repeats = 1;
