@@ -200,7 +200,9 @@ void app_sense_cycle(const struct hal_cycle *cycle)
         // What the port makes is what counts, should it ever be something else than it said.
         unlike = app_exposures_far(reading->exposure_cycles, ALL_BITS) ? unlike + 1 : 0;
         if (unlike == UNLIKE_LOOKS) {
-            sg_expose_taken(&app.expose, reading->exposure_cycles);
+            // Not sg_expose_taken: what is in force while a change is on its way is nothing that the port insists on.
+            for (uint8_t i = 0; i < HAL_CHANNELS; i++)
+                app.expose.led[i].exposure_cycles = reading->exposure_cycles[i];
             unlike = 0;
         }
     }

@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 
+from conftest import random_model
 from sparsegaze import linearity
 from sparsegaze.wire import lib
 from worn import CYCLES_PER_US, LIGHT, features, jitter
@@ -243,3 +244,21 @@ def test_exposures_do_not_hunt(board):
     changes = (flags_of(frames_of(device, 1000)) & lib.SG_FLAG_EXPOSURE != 0).sum()
     print(f"{changes} in flicker")
     assert changes <= 4
+
+
+@pytest.mark.parametrize("gap_us", [3000, 5000, 7000])
+def test_exposures_that_never_rest_find_their_place_when_the_light_does(board, gap_us):
+    """What was in force while changes were on their way is no limit of the port's: one channel stayed full for ever."""
+    nano, device = board(models={0: random_model(15, seed=1).image})
+    still(nano, device)
+    device.set_stream(raw=True, gaze=True)
+    rng, begin_us = np.random.default_rng(gap_us), nano.control.time().us
+    at_us = begin_us + 20_000
+    while at_us < begin_us + 2_800_000:
+        nano.control.set_at(int(at_us) * CYCLES_PER_US, "ambient_na", float(10 ** rng.uniform(0, 3.3)))
+        at_us += rng.uniform(0.3, 1.7) * gap_us
+    nano.control.set_at((begin_us + 2_900_000) * CYCLES_PER_US, "ambient_na", 2000.0)
+    saturated = flags_of(frames_of(device, 3600)) & lib.SG_FLAG_SATURATED != 0
+    print(f"{saturated.sum()} saturated, then {np.round(device.exposure().exposure_us, 1)} us")
+    assert saturated[:1000].any() and not saturated[-1000:].any()
+    assert max(device.exposure().exposure_us) < 40

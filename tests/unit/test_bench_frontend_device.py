@@ -89,6 +89,14 @@ def test_a_step_that_never_settles_has_no_number_of_frames(bench):
     assert bench.measures.judge_steps(frames, error, np.arange(0, 1000, 100))["settle_frames"] is None
 
 
+def test_a_step_is_settled_when_frames_are_valid_as_often_as_later(bench):
+    frames, error = np.zeros(1000, bench.board.FRAME), np.full(1000, 0.5)
+    since = np.arange(1000) % 100
+    error[(since < 8) & (np.arange(1000) // 100 % 5 == 0)] = np.nan     # a fifth of the steps, eight frames long
+    error[since % 25 == 24] = np.nan                                    # for ever
+    assert bench.measures.judge_steps(frames, error, np.arange(0, 1000, 100))["settle_frames"] == 7
+
+
 def cycle_log(begin, exposure=1600, slot=888):
     """Log rows of one sensing cycle as the virtual Nano writes them, and the instants of its six lit
     samples."""
@@ -167,7 +175,7 @@ def good_report():
     return {
         "quick": False,
         "rate_hz": 1001.0,
-        "seconds": 60.0,
+        "stream_seconds": 60.0,
         "late": 0,
         "lost": 0,
         "truth_ratio": 1.01,
@@ -217,7 +225,7 @@ def test_a_good_report_meets_every_bar_and_64_vectors_are_an_aim(bench):
         ("flicker_ratio_250", 1.3),
         ("margin", 0.9),
         ("stack_free", 204),
-        ("seconds", 10.0),
+        ("stream_seconds", 10.0),
         ("late", None),
     ],
 )
@@ -246,7 +254,7 @@ def test_every_bar_of_several_can_be_missed(bench, key, part, value):
 
 
 def test_a_missed_bar_is_named_and_the_exit_code_is_one(bench, tmp_path, capsys):
-    report = {**good_report(), "rate_hz": 900.0, "seconds": 60.0}
+    report = {**good_report(), "rate_hz": 900.0, "seconds": 60.0, "stream_seconds": 60.0}
     report["bars"] = bench.judge.bars(report)
     assert bench.judge.tell(report, tmp_path) == 1
     assert "bar missed: * rate_hz" in capsys.readouterr().err

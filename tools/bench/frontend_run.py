@@ -132,7 +132,7 @@ def worst(rows):
     lights = list(rows[0]["precision"])
     out = {
         "rate_hz": min(row["stream"]["rate_hz"] for row in rows),
-        "seconds": min(row["stream"]["seconds"] for row in rows),
+        "stream_seconds": min(row["stream"]["seconds"] for row in rows),
         "late": most(lambda row: row["stream"]["late"]),
         "lost": most(lambda row: row["stream"]["lost"]),
         "n_vectors": min(row["calibration"]["nominal"]["vectors"] for row in rows),
