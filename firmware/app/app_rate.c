@@ -144,7 +144,8 @@ SELDOM void app_rate_start(struct hal_timing *timing)
     timing->sleep = app_live.power;     // enum sg_power: 1 is low
     // What is left of the time until the next frame's first cycle is complete.
     dark += period;
-    const uint16_t spare = app.sensed ? dark - work_us() : UINT16_MAX;
+    const uint16_t work = work_us();        // in low power maybe a little more than there is
+    const uint16_t spare = !app.sensed ? UINT16_MAX : dark > work ? dark - work : 0;
     // The last sample takes a slot of 18 to arrive.
     app.busy_us = dark + us_of(period) - 6 + COST_REQUEST / CYCLES_PER_US;
     app.infer_fits = spare >= infer_us();

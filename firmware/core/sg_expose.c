@@ -303,9 +303,13 @@ uint8_t sg_expose_cycle(struct sg_expose *expose, const struct sg_reading *readi
         drowned = (uint8_t)(drowned + (reading->unlit_code[i] >= SG_EXPOSE_SATURATED_CODE));
     expose->drowned = drowned;
     uint8_t changed = 0;
-    for (uint8_t i = 0; i < CHANNELS; i++) {
+    for (uint8_t i = 0; i < CHANNELS; i++, code++) {
+        const uint8_t *const stage = &expose->led[i].stage;
+        // Most fit, and wait for their turn.
+        if (*stage > SG_EXPOSE_REFINE && *code < SG_EXPOSE_SATURATED_CODE && drowned < 2 && i != expose->next)
+            continue;
         changed |= visit(expose, reading, wiring, i);
-        expose->acquiring |= expose->led[i].stage <= SG_EXPOSE_REFINE;
+        expose->acquiring |= *stage <= SG_EXPOSE_REFINE;
     }
     return changed;
 }

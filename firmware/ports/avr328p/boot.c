@@ -25,7 +25,7 @@ static const uint8_t *looked_at = &__heap_start;
 static uint16_t stack_free;             // by the latest look that came to its end
 
 // Before anything else uses registers or stack. A watchdog reset leaves the watchdog running at 16 ms: off at
-// once.
+// once. Who comes here by a stray jump finds interrupts on and maybe LEDs lit: off as well, boot takes long.
 void boot_first(void) __attribute__((naked, used, section(".init3")));
 void boot_first(void)
 {
@@ -42,6 +42,10 @@ void boot_first(void)
                      "clr r13" "\n\t"
                      "clr r14" "\n\t"
                      "clr r15" : : "i"(&left));
+    cli();
+    DDRC = 0;
+    DDRD = 0;
+    TIMSK1 = 0;
     left_mcusr = MCUSR;
     MCUSR = 0;
     __asm__ volatile("wdr");

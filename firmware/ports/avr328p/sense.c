@@ -22,7 +22,7 @@ enum {
     LOCKOUT_WRAPS = LOCKOUT_MS * (F_CPU / 1000) / 65536 + 1,
     HELD_LEAST = 9,                 // code: what is below is an offset of the converter, not a voltage
     SUPPLY_EVERY_WRAPS = 244,       // a second
-    SUPPLY_CODE_LEAST = 130,        // 4.2 V at a bandgap of 1.2 V,
+    SUPPLY_CODE_LEAST = 130,        // 3.8 V at a bandgap of 1.2 V,
     SUPPLY_CODE_MOST = 235,         // 5.7 V at 1.0 V: beyond, nothing or something else is on the pin
     SUPPLY_MV_PER_CODE_Q8 = 6875,   // 1.1 V / 1024 / 0.04
     UNLIT_AFTER = offsetof(struct sg_reading, unlit_code) / sizeof(uint16_t),   // behind the lit code of a channel
@@ -529,7 +529,8 @@ uint8_t hal_alarm(void)
 {
     uint8_t alarm = locked_out ? SG_ALARM_LOCKOUT : 0;
     const uint8_t moved = supply_code > supply_boot ? supply_code - supply_boot : supply_boot - supply_code;
-    if (supply_code && 25 * (uint16_t)moved > supply_boot)
+    // Far out of the window, code 0, is an alarm too, but for boards that never had one within.
+    if (25 * (uint16_t)moved > supply_boot)
         alarm |= SG_ALARM_SUPPLY;
     return alarm;
 }
