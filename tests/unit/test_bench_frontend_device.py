@@ -201,6 +201,9 @@ def good_report():
         "margin": 1.2,
         "flash": {"spare": 0.12},
         "stack_free": 210,
+        "valid_nominal": 0.99,
+        "valid_flicker_250": 0.9,
+        "places": 25,
     }
 
 
@@ -227,6 +230,9 @@ def test_a_good_report_meets_every_bar_and_64_vectors_are_an_aim(bench):
         ("stack_free", 204),
         ("stream_seconds", 10.0),
         ("late", None),
+        ("valid_nominal", 0.94),
+        ("valid_flicker_250", 0.7),
+        ("places", 24),
     ],
 )
 def test_every_bar_can_be_missed(bench, key, value):
