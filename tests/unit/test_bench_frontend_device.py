@@ -94,7 +94,7 @@ def test_a_step_is_settled_when_frames_are_valid_as_often_as_later(bench):
     since = np.arange(1000) % 100
     error[(since < 8) & (np.arange(1000) // 100 % 5 == 0)] = np.nan     # a fifth of the steps, eight frames long
     error[since % 25 == 24] = np.nan                                    # for ever
-    assert bench.measures.judge_steps(frames, error, np.arange(0, 1000, 100))["settle_frames"] == 7
+    assert bench.measures.judge_steps(frames, error, np.arange(0, 1000, 100))["settle_frames"] == 8
 
 
 def cycle_log(begin, exposure=1600, slot=888):

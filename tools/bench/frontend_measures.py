@@ -16,7 +16,7 @@ AMBIENTS = ("dark", "room", "bright_room", "sun_gap")
 FREE_FRAMES = 5  # after a change of light, frames that may be saturated
 STEP_NA = (2.0, 2000.0)  # 1000:1
 STEP_S, STEADY, WINDOW = 0.2, slice(50, 90), 5
-SETTLED, USUAL = 1.1, 0.95
+SETTLED, USUAL = 1.1, 0.99
 SIGNAL_NA = 200.0
 FLICKER = 0.5
 HOLDS = (1.0, 0.7, 0.4)  # of the exposures that automatic exposure had chosen
@@ -135,7 +135,7 @@ def judge_steps(frames, error, begin):
 
     begin   [k] index of the first frame after each step
     settled: the mean over steps and a window of WINDOW frames within SETTLED of the steady one, and those
-    frames valid as often as steady ones, or nearly (USUAL of that share: sunlight flags a few for ever)
+    frames valid as often as steady ones (USUAL of that share: sunlight flags a few for ever)
     """
     rows = begin[:, None] + np.arange(STEADY.stop)
     rows = rows[rows[:, -1] < len(frames)]
