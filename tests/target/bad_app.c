@@ -3,6 +3,7 @@
 //   NOTHING      it does not
 //   HANG_LOOP    from the 400th cycle on the main loop stands, the sensing engine runs on
 //   HANG_LIT     the same, with interrupts off at a moment when emitters are lit
+//   STRAY        there a jump to address 0, as a smashed stack makes: no reset, but a start from the beginning
 //   BLOCK        interrupts are off for 250 us in every 16th cycle, later and later in it
 //   SHORT_BLOCK  the same for 6 us, in every second
 //   SLOW         5 ms of work for cycles that come every millisecond
@@ -16,7 +17,7 @@
 
 #include "hal.h"
 
-enum { NOTHING, HANG_LOOP, HANG_LIT, BLOCK, SHORT_BLOCK, SLOW };
+enum { NOTHING, HANG_LOOP, HANG_LIT, STRAY, BLOCK, SHORT_BLOCK, SLOW };
 enum { TYPE_CYCLE = 0x50, TYPE_EXPOSURE = 0x51, TYPE_TIMING = 0x52, TYPE_NOISE = 0x53 };
 
 static uint16_t cycles;
@@ -48,14 +49,16 @@ void app_on_cycle(const struct hal_cycle *cycle)
         _delay_us(BAD == BLOCK ? 250 : 6);
         sei();
     }
-    if (cycles < 400 || (BAD != HANG_LIT && BAD != HANG_LOOP))
+    if (cycles < 400 || (BAD != HANG_LIT && BAD != HANG_LOOP && BAD != STRAY))
         return;
-    if (BAD == HANG_LIT) {
+    if (BAD == HANG_LIT || BAD == STRAY) {
         // Lit are four of the six pins: look until one sees it, then stop the world.
         while (!PORTC)
             ;
         cli();
     }
+    if (BAD == STRAY)
+        __asm__ volatile("jmp 0");
     for (;;) {
     }
 }

@@ -331,6 +331,18 @@ def test_a_hang_ends_in_the_dark_within_130_ms(port_app, bad):
         assert took <= LIT_MOST
 
 
+def test_a_stray_jump_to_the_beginning_puts_the_lights_out_first_and_for_a_second(port_app):
+    """No reset: the pins stay as they are until somebody sets them, and what comes first takes 1.6 ms."""
+    app = port_app("STRAY", settle_s=0.0)
+    moments = app.moments(3.0)
+    windows = lit_windows(moments)
+    longest = max(end - begin for _, begin, end in windows)
+    dark = moments[-1][2] - windows[-1][2]
+    print(f"longest light {longest} cycles, then dark for {dark / 16e6:.2f} s")
+    assert longest <= LIT_MOST and dark >= 16_000_000
+    assert app.status().alarm & lib.SG_ALARM_LOCKOUT
+
+
 def test_a_cycle_that_interrupts_were_kept_from_is_given_up_and_nothing_lights_twice(port_app):
     """250 us without interrupts: triggers are missed. Dark at once, and for a whole cycle, and counted."""
     app = port_app("BLOCK")
