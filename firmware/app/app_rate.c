@@ -146,7 +146,7 @@ SELDOM void app_rate_start(struct hal_timing *timing)
     dark += period;
     const uint16_t work = work_us();        // in low power maybe a little more than there is
     const uint16_t spare = !app.sensed ? UINT16_MAX : dark > work ? dark - work : 0;
-    // The last sample takes a slot of 18 to arrive.
+    // The last sample takes a slot of 18 to arrive: a period / 16 - 6, within 1 us of it for the shortest.
     app.busy_us = dark + us_of(period) - 6 + COST_REQUEST / CYCLES_PER_US;
     app.infer_fits = spare >= infer_us();
     app.roomy = spare >= ROOMY_US;
