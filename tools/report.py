@@ -16,32 +16,42 @@ BEGIN = "<!-- results: written by tools/report.py from build/demo/report.json --
 END = "<!-- /results -->"
 
 
+def table_of(rows):
+    """The Markdown table of rows of cells; the first row is its head."""
+    lines = [f"| {' | '.join(row)} |" for row in rows]
+    return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]])
+
+
 def table(report):
     """The Markdown table of a report dict."""
     accuracy, stream, delay, fast = (report[key] for key in ("accuracy", "stream", "latency_ms", "fast"))
     rows = [
         ("mean / median / p95 error to the target",
-         f"**{accuracy['mean_deg']:.2f}** / {accuracy['median_deg']:.2f} / {accuracy['p95_deg']:.2f} deg", "1.57 / 1.12 / - deg"),
+         f"**{accuracy['mean_deg']:.2f}** / {accuracy['median_deg']:.2f} / {accuracy['p95_deg']:.2f} deg",
+         "1.57 / 1.12 / - deg"),
         ("the same by the full float64 GP, on the same samples", f"{accuracy['gp64_mean_deg']:.2f} deg", "-"),
-        ("mean error to where the simulated eye really looked", f"{accuracy['to_true_gaze_mean_deg']:.2f} deg", "-"),
+        ("mean error to where the simulated eye really looked",
+         f"{accuracy['to_true_gaze_mean_deg']:.2f} deg", "-"),
         ("accuracy, precision RMS-S2S (ETDQualitizer)",
          f"{accuracy['accuracy_deg']:.2f} deg, {accuracy['rms_s2s_deg']:.2f} deg", "-"),
         ("data loss (blinks, out of range)", f"{100 * accuracy['data_loss']:.1f} %", "-"),
         ("gaze rate, device time, with the features beside it", f"{stream['rate_hz']:.1f} Hz", "250 Hz"),
-        (f"the same with {fast['n_vectors']} vectors, gaze alone; lost", f"{fast['rate_hz']:.1f} Hz; {fast['lost']}", "-"),
-        ("frames streamed, lost, differing from the host core", f"{stream['frames']}, {stream['lost']}, {stream['differing']}", "-"),
-        ("where the gaze is computed", f"on the ATmega328P, {report['model']['n_vectors']} vectors", "on a PC"),
+        (f"the same with {fast['n_vectors']} vectors, gaze alone; lost",
+         f"{fast['rate_hz']:.1f} Hz; {fast['lost']}", "-"),
+        ("frames streamed, lost, differing from the host core",
+         f"{stream['frames']}, {stream['lost']}, {stream['differing']}", "-"),
+        ("where the gaze is computed",
+         f"on the ATmega328P, {report['model']['n_vectors']} vectors", "on a PC"),
         ("inference, all work on a frame (worst)",
-         f"{report['inference']['cycles']:,.0f}, {report['frame']['cycles']:,.0f} of {report['frame']['period_cycles']:,.0f} cycles",
-         "-"),
+         f"{report['inference']['cycles']:,.0f}, {report['frame']['cycles']:,.0f} "
+         f"of {report['frame']['period_cycles']:,.0f} cycles", "-"),
         ("its latency to the last byte, from mean sample time, from last sample",
          f"{delay['mean_sample_to_last_byte']:.2f} ms, {delay['last_sample_to_last_byte']:.2f} ms", "-"),
         ("flashed through the stock bootloader, verified",
          f"{report['flash']['bytes']} bytes in {report['flash']['seconds']:.1f} s (device time)", "-"),
     ]
-    lines = [f"| figure | sparsegaze, simulated person {report['seed']} | LED2Gaze, people |", "|---|---|---|"]
-    lines += [f"| {name} | {ours} | {paper} |" for name, ours, paper in rows]
-    return "\n".join(lines)
+    rows.insert(0, ("figure", f"sparsegaze, simulated person {report['seed']}", "LED2Gaze, people"))
+    return table_of(rows)
 
 
 def figure(value):
@@ -51,65 +61,80 @@ def figure(value):
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.2g}" if abs(value) < 1e-2 else f"{value:.3g}"
 
 
+def bar_rows(head, report):
+    """Rows of a benchmark: its bars and aims, what was measured, wanted, and is it met. head: the first cell."""
+    rows = [(head, "measured", "wanted", "met")]
+    for row in report["bars"]:
+        value = "-" if row["value"] is None else figure(row["value"])
+        wanted = f"{row['kind']} {row['limit']}"
+        rows.append((row["name"].replace("*", r"\*"), value, wanted, yes(row["met"])))
+    return rows
+
+
+def yes(met):
+    """A verdict as a cell; None: there is none."""
+    return "-" if met is None else "yes" if met else "**no**"
+
+
 def simulator_table(report):
     """The Markdown table of sim.json: every bar and aim with what was measured."""
-    machine, speed, offgrid = report["machine"], report["speed"], report["offgrid"]
-    rows = [(row["name"], figure(row["value"]), f"{row['kind']} {row['limit']}", "yes" if row["met"] else "**no**")
-            for row in report["bars"]]
-    ring, map_s = report["ring"], speed["seconds"]
-    rows.append(("a response of that map, microseconds", figure(1e6 * map_s / (speed["pairs"] * speed["gazes"])), "-", "-"))
-    rows.append(("the same between the nodes of a person's map", figure(1e6 / offgrid["responses_per_second_core"] / speed["pairs"]),
-                 "-", "-"))
-    rows.append(("ring: peak over median, width; with a hard crease",
-                 f"{ring['peak_over_median']:.2f}, {ring['fwhm_deg']:.1f} deg; {ring['hard_crease_peak_over_median']:.2f}", "-", "-"))
-    lines = [f"| {machine['cores']} cores, {machine['cpu'] or 'unnamed'}, load {machine['load']:.1f} | measured | wanted | met |",
-             "|---|---|---|---|"]
-    return "\n".join(lines + [f"| {' | '.join(row)} |" for row in rows])
+    machine, speed, offgrid, ring = (report[key] for key in ("machine", "speed", "offgrid", "ring"))
+    of_map_us = 1e6 * speed["seconds"] / (speed["pairs"] * speed["gazes"])
+    between_us = 1e6 / offgrid["responses_per_second_core"] / speed["pairs"]
+    hard = ring["hard_crease_peak_over_median"]
+    head = f"{machine['cores']} cores, {machine['cpu'] or 'unnamed'}, load {machine['load']:.1f}"
+    return table_of([
+        *bar_rows(head, report),
+        ("a response of that map, microseconds", figure(of_map_us), "-", "-"),
+        ("the same between the nodes of a person's map", figure(between_us), "-", "-"),
+        ("ring: peak over median, width; with a hard crease",
+         f"{ring['peak_over_median']:.2f}, {ring['fwhm_deg']:.1f} deg; {hard:.2f}", "-", "-"),
+    ])
 
 
 def inference_table(report):
     """The Markdown table of inference.json: every bar and aim with what was measured, then the peers."""
-    lines = ["| | measured | wanted | met |", "|---|---|---|---|"]
-    for row in report["bars"]:
-        value = "-" if row["value"] is None else figure(row["value"])
-        lines.append(f"| {row['name']} | {value} | {row['kind']} {row['limit']} | {'yes' if row['met'] else '**no**'} |")
+    rows = bar_rows("figure", report)
     variance = report.get("variance")
     if variance:
         for name, key in (("target", ""), ("true gaze", "truth_")):
-            inside = [variance.get(f"{key}coverage{part}") for part in (68, 95)]    # None: no sigma, nothing measured
+            inside = [variance.get(f"{key}coverage{part}") for part in (68, 95)]    # None: no sigma measured
             inside = ", ".join("-" if part is None else f"{part:.3f}" for part in inside)
-            lines.append(f"| errors to the {name} inside one sigma, inside 1.96 (0.683 and 0.95 of a Gaussian) | {inside} | - | - |")
-        lines.append(f"| frames with shut, half-shut, narrowed lids flagged; false alarms | {variance['shut_flagged']:.3f}, "
-                     f"{variance['half_flagged']:.3f}, {variance['narrow_flagged']:.3f}; {variance['false_alarms']:.3f} | - | - |")
+            rows.append((f"errors to the {name} inside one sigma, inside 1.96 (0.683 and 0.95 of a Gaussian)",
+                         inside, "-", "-"))
+        flagged = ", ".join(f"{variance[f'{lids}_flagged']:.3f}" for lids in ("shut", "half", "narrow"))
+        rows.append(("frames with shut, half-shut, narrowed lids flagged; false alarms",
+                     f"{flagged}; {variance['false_alarms']:.3f}", "-", "-"))
     defaults = [row for row in report.get("default", []) if row["dataset"].startswith("sim-")]
     if defaults:
         n, far = (sorted(row[key] for row in defaults) for key in ("n", "rms_to_gp_deg"))
-        lines.append(f"| default model of {len(n)} persons: vectors, median rms to the GP | {n[0]} to {n[-1]}, {far[len(far) // 2]:.3f} deg | - | - |")
+        rows.append((f"default model of {len(n)} persons: vectors, median rms to the GP",
+                     f"{n[0]} to {n[-1]}, {far[len(far) // 2]:.3f} deg", "-", "-"))
     shown = ("sim-2000", "smooth-0")    # the file has them all
+    ours = [row for row in report.get("default", []) if row["dataset"] in shown]
     peers = [row for row in report.get("peers", []) if row["cycles"] and row["dataset"] in shown]
-    if peers:
-        lines += ["", "| on the same chip and data | data | cycles | flash, B | error to the truth | fits | ours is better in both |",
-                  "|---|---|---|---|---|---|---|"]
-        for row in report.get("default", []):
-            if row["dataset"] in shown:
-                lines.append(f"| **sparsegaze, {row['n']} vectors** | {row['dataset']} | {figure(row['cycles'])} | {row['flash']} | "
-                             f"{row['truth_mean_deg']:.2f} deg | yes | - |")
-        for row in peers:
-            error = "-" if row["truth_mean_deg"] is None else f"{row['truth_mean_deg']:.2f} deg"
-            better = {True: "yes", False: "**no**", None: "-"}[row.get("dominated")]
-            lines.append(f"| {row['name']} {row['version'] or ''} | {row['dataset']} | {figure(row['cycles'])} | {row['flash']} | {error} | "
-                         f"{'yes' if row['fits'] else 'no'} | {better} |")
-    return "\n".join(lines)
+    return table_of(rows) + ("\n\n" + peer_table(ours, peers) if peers else "")
+
+
+def peer_table(ours, peers):
+    """The Markdown table of what was measured on the same chip and data: rows of inference.json."""
+    rows = [("on the same chip and data", "data", "cycles", "flash, B", "error to the truth", "fits",
+             "ours is better in both")]
+    for row in ours:
+        rows.append((f"**sparsegaze, {row['n']} vectors**", row["dataset"], figure(row["cycles"]),
+                     str(row["flash"]), f"{row['truth_mean_deg']:.2f} deg", "yes", "-"))
+    for row in peers:
+        error = "-" if row["truth_mean_deg"] is None else f"{row['truth_mean_deg']:.2f} deg"
+        rows.append((f"{row['name']} {row['version'] or ''}", row["dataset"], figure(row["cycles"]),
+                     str(row["flash"]), error, "yes" if row["fits"] else "no", yes(row.get("dominated"))))
+    return table_of(rows)
 
 
 def frontend_table(report):
     """The Markdown table of frontend.json: every bar and aim with what was measured on the worst seed."""
-    lines = [f"| simulated persons {report['seeds'][0]} to {report['seeds'][-1]}, the worst of them; * the default setting "
-             "| measured | wanted | met |", "|---|---|---|---|"]
-    for row in report["bars"]:
-        value = "-" if row["value"] is None else figure(row["value"])
-        lines.append(f"| {row['name'].replace('*', chr(92) + '*')} | {value} | {row['kind']} {row['limit']} | {'yes' if row['met'] else '**no**'} |")
-    return "\n".join(lines)
+    seeds = report["seeds"]
+    head = f"simulated persons {seeds[0]} to {seeds[-1]}, the worst of them; * the default setting"
+    return table_of(bar_rows(head, report))
 
 
 SIM_BEGIN = "<!-- simulator: written by tools/report.py from build/bench/sim.json -->"
@@ -120,15 +145,18 @@ FRONTEND_BEGIN = "<!-- frontend: written by tools/report.py from build/bench/fro
 FRONTEND_END = "<!-- /frontend -->"
 KINDS = {
     "demo": (Path("build/demo/report.json"), BEGIN, END, table, "make demo"),
-    "frontend": (Path("build/bench/frontend.json"), FRONTEND_BEGIN, FRONTEND_END, frontend_table, "make bench-frontend"),
-    "inference": (Path("build/bench/inference.json"), INFERENCE_BEGIN, INFERENCE_END, inference_table, "make bench-inference"),
+    "frontend": (Path("build/bench/frontend.json"), FRONTEND_BEGIN, FRONTEND_END, frontend_table,
+                 "make bench-frontend"),
+    "inference": (Path("build/bench/inference.json"), INFERENCE_BEGIN, INFERENCE_END, inference_table,
+                  "make bench-inference"),
     "sim": (Path("build/bench/sim.json"), SIM_BEGIN, SIM_END, simulator_table, "make bench-sim"),
 }
 
 
 def main():
     """Rewrite or check the README. Returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kind", nargs="?", choices=KINDS, default="demo")
     parser.add_argument("--report", type=Path, help="default: where the command that measures puts it")
     parser.add_argument("--readme", type=Path, default=Path("README.md"))
