@@ -304,9 +304,11 @@ static void take(const struct hal_cycle *cycle)
     }
     left = cycle->left;
     under_way = left != 0;
-    if (acquires())                 // the light that moved rests in all likelihood: no reason to interpolate
-        app.light.moving = 0;
     sg_light_add(&app.light, &cycle->reading);
+    // The light that moved rests in all likelihood: no reason to interpolate. After the cycle: what it says of
+    // channels beside those with new exposures is no light.
+    if (acquires())
+        app.light.moving = app.light.state = 0;
 }
 
 void app_on_cycle(const struct hal_cycle *cycle)
