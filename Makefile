@@ -2,7 +2,8 @@
 # The one entry point; CI runs `make test`. `make` alone lists what there is.
 #
 #   SEED=k       the simulated person, parts and noise of `make demo`; SEEDS="..." those of `make seeds`
-#   ARGS="..."   handed on: to tools/demo.py by `make demo`, to pytest by `make test`, to tools/bench by `make bench-...`
+#   ARGS="..."   handed on: to tools/demo.py by `make demo`, to pytest by `make test`, to tools/bench by
+#                `make bench-...`
 #   PYTHON=...   the interpreter that .venv is made with
 
 SHELL := /bin/sh
@@ -29,7 +30,8 @@ quietly = echo "$(1)"; { $(1); } >build/native/log 2>&1 || { cat build/native/lo
 # $(1) over $(2) when it differs, at one stroke because somebody may be reading; then the command $(3).
 refresh = cmp -s $(1) $(2) || { cp $(1) $(2).new && mv $(2).new $(2) && $(if $(3),$(3),:); }
 
-.PHONY: help setup firmware native demo seeds test bench-sim bench-inference bench-frontend check size lock clean distclean
+.PHONY: help setup firmware native demo seeds test bench-sim bench-inference bench-frontend check size lock
+.PHONY: clean distclean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/  make \1#\2/p' $(MAKEFILE_LIST) | \
@@ -38,7 +40,7 @@ help: ## this list
 setup: ## install what is missing: Debian packages (when root or sudo), .venv with pinned packages
 	@sh tools/setup.sh
 
-firmware: setup build/firmware/cortex-m4.elf ## build the firmware for the Nano and for a Cortex-M4 in QEMU, check their links, put the hex into the Python package
+firmware: setup build/firmware/cortex-m4.elf ## build it for Nano and Cortex-M4; the hex goes into the package
 	@$(PY) tools/pio_offline.py run -s -e nano
 	@$(PY) tools/check_link.py $(PIO)/firmware.elf
 	@mkdir -p build/firmware $(dir $(HEX))
@@ -47,11 +49,12 @@ firmware: setup build/firmware/cortex-m4.elf ## build the firmware for the Nano 
 	@$(call refresh,$(PIO)/firmware.hex,$(HEX),echo "$(HEX) changed: commit it together with the sources")
 
 # No C library: what is linked is what is in firmware/.
-build/firmware/cortex-m4.elf: $(wildcard firmware/core/*.[ch] firmware/app/*.[ch] $(M4)/* $(M4)/include/*) Makefile
+build/firmware/cortex-m4.elf: Makefile \
+    $(wildcard firmware/core/*.[ch] firmware/app/*.[ch] $(M4)/* $(M4)/include/*)
 	@mkdir -p $(dir $@)
-	@$(M4_CC) $(M4_FLAGS) -nostdinc -isystem "$$($(M4_CC) -print-file-name=include)" $(addprefix -I,$(M4)/include \
-	    firmware/core firmware/app $(M4)) -nostdlib -T $(M4)/port.ld -Wl,--gc-sections,--fatal-warnings \
-	    $(filter %.c,$^) -o $@.new
+	@$(M4_CC) $(M4_FLAGS) -nostdinc -isystem "$$($(M4_CC) -print-file-name=include)" \
+	    $(addprefix -I,$(M4)/include firmware/core firmware/app $(M4)) -nostdlib \
+	    -T $(M4)/port.ld -Wl,--gc-sections,--fatal-warnings $(filter %.c,$^) -o $@.new
 	@$(PY) tools/check_link.py $@.new && mv $@.new $@
 
 native: setup build/native/core build/native/sim ## build what runs here: core, simulator, virtual Nano
@@ -81,11 +84,11 @@ bench-sim: setup native ## the simulator's speed against its error, with peers; 
 	@sh tools/bench/setup_bench.sh
 	@$(PY) tools/bench/bench_sim.py $(ARGS)
 
-bench-inference: setup firmware native ## inference on the device, cycles against error, with peers; ARGS="--quick --no-peers"
+bench-inference: setup firmware native ## cycles on the device against error, peers; ARGS="--quick --no-peers"
 	@sh tools/bench/setup_bench.sh --without-llvm
 	@$(PY) tools/bench/bench_inference.py $(ARGS)
 
-bench-frontend: setup firmware native ## rate, latency, noise, ambient light, eye safety of the front end; ARGS="--quick"
+bench-frontend: setup firmware native ## the front end: rate, latency, noise, ambient light; ARGS="--quick"
 	@$(PY) tools/bench/bench_frontend.py $(ARGS)
 
 check: firmware ## the quick static checks: includes, licences, packaging, link

@@ -14,8 +14,8 @@
 //           Beckmann glint whose width is the tear film's roughness and both lenses' radii (a disc of radius
 //           r at distance d widens the lobe of half vectors by r / (2 d)).
 // Left out  interreflection, the lashes' own light, the lids' margin between skin and eye (black), the
-//           pupil's retro-reflection, the pupil's decentration, posterior cornea and lens, and of the two paths
-//           from a site beside the eye to a spot of the iris next to a caustic the longer one.
+//           pupil's retro-reflection, the pupil's decentration, posterior cornea and lens, and of the two
+//           paths from a site beside the eye to a spot of the iris next to a caustic the longer one.
 #ifndef SIM_SCENE_H
 #define SIM_SCENE_H
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole main job on a virtual Nano, measured: flash, calibrate, stream; then report.json, demo.png and the bars.
+"""The main job on a virtual Nano, measured: flash, calibrate, stream; then report.json, demo.png, the bars.
 
-`make demo` calls this after set-up and build. The virtual Nano starts empty: it is flashed through its bootloader, a
-simulated person is calibrated in lockstep (as fast as this machine computes), the power is cycled, and the gaze that the
-device computes is streamed in real time over held-out targets. Exits 1 when a bar is missed, naming it.
+`make demo` calls this after set-up and build. The virtual Nano starts empty: it is flashed through its
+bootloader, a simulated person is calibrated in lockstep (as fast as this machine computes), the power is
+cycled, and the gaze that the device computes is streamed in real time over held-out targets. Exits 1 when a
+bar is missed, naming it.
 """
 import argparse
 import csv
@@ -34,26 +35,32 @@ CPU_MHZ = 16.0
 ORDER = (5, 0, 1, 4, 2, 3)          # of the channels in a sensing cycle
 SLACK_CYCLES = 48                   # times of the device are whole microseconds
 FRESH_S, READY_S = 600.0, 240.0     # bars: whole run on a fresh clone, and when set up
-LOSS_MOST = 0.2                     # bar: blinks alone cost about 0.09 (15 a minute, 0.24 s and the hold after each)
+LOSS_MOST = 0.2                     # bar: blinks alone cost 0.09 (15 a minute, 0.24 s and a hold for each)
 TARGETS, HELD_OUT = 120, 25
 ALONE_S, SETTLE_S = 4.0, 1.0        # of the gaze stream alone, for rate and latency
-RESULTS = ("report.json", "demo.png", "map.png", "gaze.csv", "latency.csv", "latency_64.csv", "latency_features.csv",
-           "recording.csv", "model.sgm")
-SECTION_INFER, SECTION_FRAME = "0", "5"     # GPIOR0 sections of the firmware: inference, and all work on a frame
+RESULTS = ("report.json", "demo.png", "map.png", "gaze.csv", "latency.csv", "latency_64.csv",
+           "latency_features.csv", "recording.csv", "model.sgm")
+SECTION_INFER, SECTION_FRAME = "0", "5"     # GPIOR0 sections of the firmware: inference, all work on a frame
 
-# The demo's bars are about a full model; left alone, calibrate takes the fewest vectors that do, some 25. A thousand
-# gazes a second, and the latency that goes with them, are for as many as fit into a millisecond.
+# The demo's bars are about a full model; left alone, calibrate takes the fewest vectors that do, some 25. A
+# thousand gazes a second, and the latency that goes with them, are for as many as fit into a millisecond.
 VECTORS, FAST_VECTORS = 64, 15
 
 
 def main():
     """Parse the command line, run, report. Returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seed", type=int, default=1, help="simulated person, parts, noise and targets (default 1)")
-    parser.add_argument("--started", type=float, default=None, help="when `make demo` began, seconds since the epoch")
-    parser.add_argument("--out", type=Path, default=Path("build/demo"), help="folder of the results (default build/demo)")
-    parser.add_argument("--targets", type=int, default=TARGETS, help=f"calibration targets (default {TARGETS})")
-    parser.add_argument("--held-out", type=int, default=HELD_OUT, help=f"validation targets (default {HELD_OUT})")
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=1,
+                        help="simulated person, parts, noise and targets (default 1)")
+    parser.add_argument("--started", type=float, default=None,
+                        help="when `make demo` began, seconds since the epoch")
+    parser.add_argument("--out", type=Path, default=Path("build/demo"),
+                        help="folder of the results (default build/demo)")
+    parser.add_argument("--targets", type=int, default=TARGETS,
+                        help=f"calibration targets (default {TARGETS})")
+    parser.add_argument("--held-out", type=int, default=HELD_OUT,
+                        help=f"validation targets (default {HELD_OUT})")
     parser.add_argument("--fresh", action="store_true", help="nothing was set up when `make demo` began")
     options = parser.parse_args()
     started = time.time() if options.started is None else options.started
@@ -71,12 +78,15 @@ def main():
     save_maps(response_map(headset, draw_person(options.seed)), headset, options.out / "map.png")
     report["total_s"] = round(time.time() - started, 2)
     report["bars"] = bars(report)
-    (options.out / "report.json").write_text(json.dumps(calibrate.plain(report), indent=1) + "\n", encoding="utf-8")
+    (options.out / "report.json").write_text(
+        json.dumps(calibrate.plain(report), indent=1) + "\n", encoding="utf-8")
     missed = [bar for bar in report["bars"] if not bar["met"]]
     for bar in report["bars"]:
-        print(f"  {'ok  ' if bar['met'] else 'MISS'} {bar['name']:32} {bar['value']!s:>22}   bar {bar['bar']}")
-    print(f"{options.out}/report.json, gaze.csv, demo.png and map.png written: simulated person {options.seed}, "
-          f"mean error {report['accuracy']['mean_deg']:.2f} deg at {report['stream']['rate_hz']:.0f} Hz")
+        met = "ok  " if bar["met"] else "MISS"
+        print(f"  {met} {bar['name']:32} {bar['value']!s:>22}   bar {bar['bar']}")
+    print(f"{options.out}/report.json, gaze.csv, demo.png and map.png written: "
+          f"simulated person {options.seed}, mean error {report['accuracy']['mean_deg']:.2f} deg "
+          f"at {report['stream']['rate_hz']:.0f} Hz")
     for bar in missed:
         print(f"demo: bar missed: {bar['name']} is {bar['value']}, needs {bar['bar']}", file=sys.stderr)
     return 1 if missed else 0
@@ -97,8 +107,8 @@ def run(options):
             flashed = flash.flash_hex(link, progress=progress)
         say(f"calibrating: {options.targets} targets, in lockstep with the virtual clock")
         began = time.time()
-        calibration = calibrate.run(nano.port, n_targets=options.targets, vectors=VECTORS, seed=seed, n_validation=0,
-                                    folder=out, progress=progress)
+        calibration = calibrate.run(nano.port, n_targets=options.targets, vectors=VECTORS, seed=seed,
+                                    n_validation=0, folder=out, progress=progress)
         calibration_s = time.time() - began
         with Device(nano.port) as device:
             before = model_crc(device)
@@ -111,7 +121,8 @@ def run(options):
             nano.control.markers_clear()
             calibrated = calibration.capture.run.plan.target_deg
             plan = targets.validation_plan(options.held_out, seed, avoid_deg=calibrated)
-            validation = validate.measure(device, screen_for(device), plan, csv=out / "gaze.csv", progress=progress)
+            validation = validate.measure(device, screen_for(device), plan, csv=out / "gaze.csv",
+                                          progress=progress)
             nano.control.frames(None)
             sections, counters = nano.control.markers(), nano.control.counters()
             status, period_us, limit_hz = device.status(), *timing(device)
@@ -131,34 +142,37 @@ def run(options):
     measured["stream"]["limit_hz"] = limit_hz
     measured["stream"]["wall_seconds"] = float(np.ptp(validation.run.frames["host_s"][inside]))
     infer, frame = sections[SECTION_INFER], sections[SECTION_FRAME]
+    infer_net, frame_net = sections[SECTION_INFER + "n"], sections[SECTION_FRAME + "n"]
     model = calibration.fit.model
+    with_features = latency(features_log, validation.run.frames, validation.run.offset_us, 2)
     report = {
         "simulated": True, "seed": seed, "headset": f"headsets/{HEADSET.name}", "map_s": round(map_s, 2),
         "flash": {"bytes": flashed.bytes, "verified": flashed.verified, "seconds": round(flashed.seconds, 3),
                   "bootloader": flashed.bootloader, "baud": flashed.baud},
         "calibration": {"targets": options.targets, "seconds": round(calibration_s, 2),
                         "fit": calibrate.plain(calibration.fit.report)},
-        "model": {"n_vectors": model.vectors, "crc_host": f"{calibration.upload.crc:08X}", "crc_before": f"{before:08X}",
-                  "crc_device": f"{after:08X}", "bytes": len(model.image)},
+        "model": {"n_vectors": model.vectors, "bytes": len(model.image),
+                  "crc_host": f"{calibration.upload.crc:08X}",
+                  "crc_before": f"{before:08X}", "crc_device": f"{after:08X}"},
         "stream": measured["stream"], "accuracy": accuracy,
         # Net of interrupts, which the sensing engine and the line take in between; gross beside it.
-        "inference": {"cycles": sections[SECTION_INFER + "n"].most, "cycles_mean": sections[SECTION_INFER + "n"].mean,
+        "inference": {"cycles": infer_net.most, "cycles_mean": infer_net.mean,
                       "cycles_with_interrupts": infer.most},
-        "frame": {"cycles": sections[SECTION_FRAME + "n"].most, "cycles_mean": sections[SECTION_FRAME + "n"].mean,
+        "frame": {"cycles": frame_net.most, "cycles_mean": frame_net.mean,
                   "cycles_with_interrupts": frame.most, "period_cycles": period_us * CPU_MHZ},
         "latency_ms": fast.pop("latency_ms"), "fast": {"n_vectors": small.vectors, **fast},
-        "full": {**full, "with_features_ms": latency(features_log, validation.run.frames, validation.run.offset_us, 2)},
+        "full": {**full, "with_features_ms": with_features},
         "counters": counters,
         "device": {key: calibrate.plain(getattr(status, key)) for key in
-                   ("late_frames", "late_slots", "tx_dropped", "rx_bad", "rx_overrun", "saturated", "starved", "stack_free",
-                    "fault", "alarm", "supply_mv", "cycles_max")},
+                   ("late_frames", "late_slots", "tx_dropped", "rx_bad", "rx_overrun", "saturated", "starved",
+                    "stack_free", "fault", "alarm", "supply_mv", "cycles_max")},
         "notes": measured["notes"],
     }
     return report, calibration, validation
 
 
 def with_held_frames(validation):
-    """The mean error as it would be without the hold after a blink (SG_FLAG_RECOVERING): what that flag is worth."""
+    """The mean error without the hold after a blink (SG_FLAG_RECOVERING): what that flag is worth."""
     refused = lib.SG_FLAG_NO_MODEL | lib.SG_FLAG_OUT_OF_RANGE | lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED
     frames = validation.run.frames
     rows = validation.settled & frames["has_gaze"] & ((frames["gaze_flags"] & refused) == 0)
@@ -177,7 +191,7 @@ def timing(device):
 
 
 def gaze_alone(device, screen, path):
-    """Stream the gaze alone for ALONE_S, as an application would: {rate_hz, limit_hz, lost, late, latency_ms}.
+    """Stream gaze alone for ALONE_S, as an application would: {rate_hz, limit_hz, lost, late, latency_ms}.
 
     path    where the virtual Nano's log goes
     """
@@ -198,8 +212,8 @@ def gaze_alone(device, screen, path):
     frames["seq"], frames["t_us"], frames["infer_us"] = np.array(rows).T
     frames["has_gaze"] = True
     seconds = (rows[-1][1] - rows[0][1]) * 1e-6
-    return {"rate_hz": (len(rows) - 1) / seconds, "limit_hz": limit_hz, "lost": device.lost - lost, "late": late,
-            "latency_ms": latency(path, frames, screen.offset_us, packets=1)}
+    return {"rate_hz": (len(rows) - 1) / seconds, "limit_hz": limit_hz, "lost": device.lost - lost,
+            "late": late, "latency_ms": latency(path, frames, screen.offset_us, packets=1)}
 
 
 def model_crc(device):
@@ -212,8 +226,8 @@ def latency(path, frames, offset_us, packets):
     """Mean sample time, and last sample, to the last byte's stop bit of the gaze frame; ms of device time.
 
     path        the virtual Nano's log of cycles: lights, pins, samples and ends of packets
-    frames      record array of session.FRAME, which say when each inference was done: the packet whose end is next is
-                the gaze
+    frames      record array of session.FRAME, which say when each inference was done: the packet whose end is
+                next is the gaze
     offset_us   device time minus the virtual Nano's time, to some 0.5 ms: which sensing cycle a frame is of
     packets     of a frame: 1 or 2
     Frames with anything else on the line, such as the answer to a ping, are left out.
@@ -221,7 +235,8 @@ def latency(path, frames, offset_us, packets):
     mean, last, sent = moments(path)
     frames = frames[frames["has_gaze"]]
     at = (frames["t_us"] - offset_us) * CPU_MHZ
-    nothing = SparsegazeError("the virtual Nano logged no frame whose bytes could be told apart", "run the demo again")
+    nothing = SparsegazeError("the virtual Nano logged no frame whose bytes could be told apart",
+                              "run the demo again")
     if not len(mean) or not len(at):
         raise nothing
     at -= np.median(at - mean[nearest(mean, at)])
@@ -239,10 +254,10 @@ def latency(path, frames, offset_us, packets):
 
 
 def moments(path):
-    """Of a log, in cycles: (mean middle of six lit exposures [n], last sample [n]) of sensing cycles, ends of packets.
+    """Of a log, in cycles: (mean middle of six lit exposures [n], last sample [n], ends of packets).
 
-    Rows event,cycle: lit:<mask>; drive<pin>:<3 released>; adc:<channel sampled>; delimiter. A sensing cycle samples the
-    channels in ORDER, pair after pair, each pair lit and then unlit.
+    Rows event,cycle: lit:<mask>; drive<pin>:<3 released>; adc:<channel sampled>; delimiter. A sensing cycle
+    samples the channels in ORDER, pair after pair, each pair lit and then unlit.
     """
     mean, last, sent, middles, released, lit, unlit = [], [], [], [], {}, False, 0
     with open(path, newline="", encoding="ascii") as file:
@@ -295,7 +310,8 @@ def bars(report):
         ("stream.lost", stream["lost"] + stream["torn"], "0", stream["lost"] + stream["torn"] == 0),
         ("stream.bit_identical", stream["bit_identical"], "true", stream["bit_identical"] is True),
         ("accuracy.mean_deg", round(accuracy["mean_deg"], 3), "<= 1.0", accuracy["mean_deg"] <= 1.0),
-        ("accuracy.data_loss", round(accuracy["data_loss"], 3), f"<= {LOSS_MOST}", accuracy["data_loss"] <= LOSS_MOST),
+        ("accuracy.data_loss", round(accuracy["data_loss"], 3), f"<= {LOSS_MOST}",
+         accuracy["data_loss"] <= LOSS_MOST),
         ("fast.rate_hz", round(report["fast"]["rate_hz"], 1), ">= 1000", report["fast"]["rate_hz"] >= 1000),
         ("fast.lost", report["fast"]["lost"], "0", report["fast"]["lost"] == 0),
         ("fast.latency, mean sample to last byte", round(delay["mean_sample_to_last_byte"], 3), "<= 2.5 ms",

@@ -22,7 +22,8 @@ def draw(path, report, calibration, validation):
     _trace(axes[1, 0], validation)
     _features(axes[1, 1], calibration)
     _numbers(axes[1, 2], report)
-    figure.suptitle(f"sparsegaze demo: virtual Nano, simulated person {report['seed']}, gaze computed on the device", fontsize=15)
+    figure.suptitle(f"sparsegaze demo: virtual Nano, simulated person {report['seed']}, "
+                    "gaze computed on the device", fontsize=15)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
@@ -32,10 +33,11 @@ def _targets(axis, validation):
     gaze = validation.run.gaze_deg[rows]
     axis.plot(gaze[:, 0], gaze[:, 1], ".", ms=1.2, alpha=0.25, color=BLUE, label="gaze, every valid frame")
     for row in validation.per_target():
-        axis.plot([row["target_az_deg"], row["gaze_az_deg"]], [row["target_el_deg"], row["gaze_el_deg"]], "-", color=RED, lw=1.6)
+        axis.plot([row["target_az_deg"], row["gaze_az_deg"]], [row["target_el_deg"], row["gaze_el_deg"]],
+                  "-", color=RED, lw=1.6)
     axis.plot(plan[:, 0], plan[:, 1], "k+", ms=10, mew=1.6, label="held-out target")
-    axis.set(title="Held-out targets", xlabel="azimuth (deg, + right)", ylabel="elevation (deg, + up)", aspect="equal",
-             xlim=(-24, 24), ylim=(-24, 30))
+    axis.set(title="Held-out targets", xlabel="azimuth (deg, + right)", ylabel="elevation (deg, + up)",
+             aspect="equal", xlim=(-24, 24), ylim=(-24, 30))
     axis.legend(fontsize=8, loc="upper right", ncol=2, markerscale=2)
 
 
@@ -46,7 +48,8 @@ def _errors(axis, report, validation):
     for key, style in (("median_deg", "--"), ("mean_deg", "-"), ("p95_deg", ":")):
         axis.axvline(accuracy[key], color=RED, ls=style, label=f"{key[:-4]} {accuracy[key]:.2f} deg")
     axis.axvline(1.57, color=GREY, ls="-.", label="LED2Gaze, mean of 14 people 1.57 deg")
-    axis.set(title=f"Error to the target, {accuracy['frames']} frames, data loss {100 * accuracy['data_loss']:.1f} %",
+    axis.set(title=f"Error to the target, {accuracy['frames']} frames, "
+                   f"data loss {100 * accuracy['data_loss']:.1f} %",
              xlabel="error per frame (deg; the last bin holds all above)", ylabel="frames")
     axis.legend(fontsize=8)
 
@@ -56,8 +59,8 @@ def _field(axis, validation):
     x, y = np.array([[row["target_az_deg"], row["target_el_deg"]] for row in table]).T
     dots = axis.scatter(x, y, c=[row["mean_deg"] for row in table], s=330, cmap="viridis", vmin=0)
     for row in table:
-        axis.annotate(f"{row['mean_deg']:.1f}", (row["target_az_deg"], row["target_el_deg"]), ha="center", va="center",
-                      fontsize=8, color="white")
+        axis.annotate(f"{row['mean_deg']:.1f}", (row["target_az_deg"], row["target_el_deg"]), ha="center",
+                      va="center", fontsize=8, color="white")
     axis.figure.colorbar(dots, ax=axis, label="mean error (deg)", shrink=0.8)
     axis.set(title="Where the error is", xlabel="azimuth (deg)", ylabel="elevation (deg)", aspect="equal",
              xlim=(-23, 23), ylim=(-23, 23))
@@ -105,7 +108,8 @@ def _numbers(axis, report):
         ("bit-identical with the host core", "yes" if stream["bit_identical"] else "NO"),
         ("calibration vectors on the device", f"{report['model']['n_vectors']}"),
         ("inference, worst", f"{report['inference']['cycles']:.0f} cycles"),
-        ("all work on a frame, worst", f"{report['frame']['cycles']:.0f} of {report['frame']['period_cycles']:.0f} cycles"),
+        ("all work on a frame, worst",
+         f"{report['frame']['cycles']:.0f} of {report['frame']['period_cycles']:.0f} cycles"),
         (f"gaze alone, {fast['n_vectors']} vectors", f"{fast['rate_hz']:.1f} Hz, {fast['lost']} lost"),
         ("its mean sample to last byte (worst)",
          f"{delay['mean_sample_to_last_byte']:.2f} ({delay['mean_sample_to_last_byte_max']:.2f}) ms"),

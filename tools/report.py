@@ -62,7 +62,7 @@ def figure(value):
 
 
 def bar_rows(head, report):
-    """Rows of a benchmark: its bars and aims, what was measured, wanted, and is it met. head: the first cell."""
+    """Rows of a benchmark's bars and aims: what was measured, what wanted, is it met. head: first cell."""
     rows = [(head, "measured", "wanted", "met")]
     for row in report["bars"]:
         value = "-" if row["value"] is None else figure(row["value"])

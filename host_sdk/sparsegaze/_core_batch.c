@@ -15,12 +15,12 @@
 int sg_batch_infer(const struct sg_model_view *view, const uint16_t *features, const uint8_t *raw_flags,
                    const struct sg_affine *recentre, struct sg_gaze *out, size_t n);
 
-// sg_gp_predict over n samples. features[n * 6]; out[n]. Returns SG_OK, or SG_E_RANGE if any sample saturated.
+// sg_gp_predict over n samples. features[n * 6]; out[n]. Returns SG_OK, or SG_E_RANGE if any saturated.
 int sg_batch_predict(const struct sg_model_view *view, const uint16_t *features, struct sg_gp_point *out,
                      size_t n);
 
-// sg_light_add over n readings, and sg_light_features after every `repeats` of them. feature[n / repeats * 6];
-// flags[n / repeats] or NULL.
+// sg_light_add over n readings, and sg_light_features after every `repeats` of them.
+// feature[n / repeats * 6]; flags[n / repeats] or NULL.
 void sg_batch_light(struct sg_light *light, const struct sg_reading *reading, size_t n, size_t repeats,
                     uint16_t *feature, uint8_t *flags);
 

@@ -18,8 +18,8 @@ from cffi import FFI
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 CORE = os.path.normpath(os.path.join(HERE, "..", "..", "firmware", "core"))
-HEADERS = ("sg_err.h", "sg_wire.h", "sg_model.h", "sg_gp.h", "sg_mlp.h", "sg_reading.h", "sg_light.h", "sg_expose.h",
-           "sg_health.h", "sg_link.h", "sg_track.h")
+HEADERS = ("sg_err.h", "sg_wire.h", "sg_model.h", "sg_gp.h", "sg_mlp.h", "sg_reading.h", "sg_light.h",
+           "sg_expose.h", "sg_health.h", "sg_link.h", "sg_track.h")
 SOURCES = ("sg_wire.c", "sg_model.c", "sg_gp.c", "sg_gp_loop.c", "sg_gp_table.c",
            "sg_mlp.c", "sg_mlp_loop.c", "sg_mlp_table.c", "sg_light.c", "sg_light_loop.c",
            "sg_light_table.c", "sg_expose.c", "sg_health.c",

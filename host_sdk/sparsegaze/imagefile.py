@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of stored images (models, networks): read as hostile, written whole or not at all, sealed by a CRC."""
+"""Files of stored images (models, networks): read as hostile, written whole or not at all, with a CRC."""
 
 import os
 import zlib
@@ -15,7 +15,8 @@ def sealed(image):
 def load(kind, path, most_bytes, expected, repeat):
     """kind(image) of a file of at most most_bytes; kind checks the image and keeps it as .image.
 
-    expected   what the file should be, in the remedy when it cannot be read;  repeat: the remedy for a long one
+    expected   what the file should be, in the remedy when it cannot be read
+    repeat     the remedy for a long one
     Raises ModelError, naming the file.
     """
     try:

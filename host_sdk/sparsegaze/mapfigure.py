@@ -129,7 +129,8 @@ def draw_place(panel, made, sensor, state=0):
         shown[tuple(p["position_mm"])] = lit
     for position, lit in shown.items():
         x, y = np.add(position, slip)[:2]
-        panel.plot(x, y, "o", color=COLOURS["glint"] if lit else "white", markeredgecolor=FAINT, markersize=6, zorder=3)
+        panel.plot(x, y, "o", color=COLOURS["glint"] if lit else "white", markeredgecolor=FAINT,
+                   markersize=6, zorder=3)
     port = sensors[sensor]
     start, aim = np.add(port["position_mm"], slip), np.array(port["aim"])
     # to the plane of the cornea

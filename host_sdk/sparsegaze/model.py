@@ -106,7 +106,8 @@ class DeviceModel:
         """Pack a model.
 
         offset, gain_q12   [d] feature units and s steps per feature step (Q4.12); gain 0 drops the channel
-        bias, trend        [2], [2, d] integers, 2^-(weight_frac_bits + 12) deg (trend: 16 bits, per step of s)
+        bias, trend        [2], [2, d] integers, 2^-(weight_frac_bits + 12) deg (trend: 16 bits, per
+                           step of s)
         centres            [n, d] 0..255;  weights [n, 2] signed 16 bit, unit 2^-weight_frac_bits deg
         trust              trust.Trust, or None for a model that flags only what leaves the box
         Raises ModelError for a value that its field cannot hold.
@@ -167,7 +168,8 @@ class DeviceModel:
     trend = property(lambda self: self._head["trend"].astype(np.int64))
     centres = property(lambda self: self._records["c"].astype(np.int64))
     weights = property(lambda self: self._records["weight"].astype(np.int64))
-    trust = property(lambda self: Trust.unpack(self.image[PAGE_BYTES : len(self.image) - self.vectors * RECORD_BYTES]))
+    trust = property(
+        lambda self: Trust.unpack(self.image[PAGE_BYTES : len(self.image) - self.vectors * RECORD_BYTES]))
 
     def predict(self, features, recentre_deg=(0.0, 0.0)):
         """Gaze by the firmware's own code.
@@ -191,7 +193,7 @@ class DeviceModel:
         return out["azimuth_deg_q7"] / DEG_Q7, out["elevation_deg_q7"] / DEG_Q7, out["flags"].copy()
 
     def judge(self, features):
-        """Gaze and what the device knows of its error, by the firmware's own code: Judged; features as above."""
+        """Gaze and what the device knows of its error, by the firmware's code: Judged. Features as above."""
         from . import _core
 
         ffi, lib = _core.ffi, _core.lib
@@ -292,7 +294,7 @@ def emulate(model, features, recentre_deg=(0.0, 0.0)):
 
 
 def emulate_point(model, features):
-    """What struct sg_gp_point holds: (q7 int64 [n, 2], outside bool [n], doubt int64 [n], sigma code int64 [n]).
+    """What struct sg_gp_point holds: (q7 [n, 2], outside bool [n], doubt [n], sigma code [n]), else int64.
 
     q7 before it saturates.
     """

@@ -156,7 +156,8 @@ def section_counts(data):
     Raises ProtocolError when a record is damaged or missing.
     """
     records = np.frombuffer(data, SCOPE, len(data) // SCOPE.itemsize)
-    if (records["mark"] != SCOPE_MARK).any() or not np.array_equal(records["number"], np.arange(len(records)) % 65536):
+    numbers = np.arange(len(records)) % 65536
+    if (records["mark"] != SCOPE_MARK).any() or not np.array_equal(records["number"], numbers):
         raise ProtocolError("the Cortex-M4's record of its sections is damaged",
                             "build it anew: make firmware")
     empty = records["ticks"][records["section"] == SECTION_EMPTY]

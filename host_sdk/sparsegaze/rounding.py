@@ -100,9 +100,9 @@ def error_bound_deg(model):
 
     The expansion is that of the stored centres, half squares, weights, trend and bias at the same inputs s,
     plus a
-    constant: half of the most that the left-out products of low bytes can come to. Errors: kernels 10 steps of
-    2^-16 (sg_gp.h); the left-out products, then within half of their range; floors of one accumulator step;
-    rounding of the result to 1/128 deg.
+    constant: half of the most that the left-out products of low bytes can come to. Errors: kernels 10 steps
+    of 2^-16 (sg_gp.h); the left-out products, then within half of their range; floors of one accumulator
+    step; rounding of the result to 1/128 deg.
     """
     from .reach import KERNEL_ERROR
 

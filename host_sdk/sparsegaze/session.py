@@ -114,7 +114,8 @@ class Run:
     """A finished (or cut) run.
 
     frames          record array [n] of FRAME: seq, t_us, host_s, features, raw_flags, span_us (mean sample
-                    time to last sample), model_crc, recentre, has_gaze, gaze_q7 (azimuth, elevation in 1/128 deg), gaze_flags, gaze_sigma, infer_us
+                    time to last sample), model_crc, recentre, has_gaze, gaze_q7 (azimuth, elevation in 1/128
+                    deg), gaze_flags, gaze_sigma, infer_us
     onset_us        int64 [k], device time at which each target really appeared; k < n_targets when cut
     target_index    int64 [n], which target was up; -1 outside the plan
     lost, torn, bad frames missing by sequence number; with a part missing; with a bad CRC

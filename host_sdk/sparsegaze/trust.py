@@ -164,6 +164,6 @@ def grid_bytes(page):
 
 
 def sigma_deg(code):
-    """Standard deviation of each angle from sigma_log2_q4 (a number or an array): degrees, NaN for 0 (unknown)."""
+    """Standard deviation of each angle, deg, from sigma_log2_q4 (number or array); NaN for 0 (unknown)."""
     code = np.asarray(code, float)
     return np.where(code == 0, np.nan, 2.0 ** (code / 16.0 - 8.0))

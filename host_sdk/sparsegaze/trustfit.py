@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a calibration to a Trust: what features gaze explains, how far they may be off, how wrong gaze then is.
+"""From a calibration to a Trust: which features gaze explains, how far they may be off, how wrong gaze is.
 
-A gaze moves the features on a surface. With lids half closed, or a headset that has slipped, they leave it, long
-before they leave the box of the calibration: in six channels a surface leaves four directions free. The
+A gaze moves the features on a surface. With lids half closed, or a headset that has slipped, they leave it,
+long before they leave the box of the calibration: in six channels a surface leaves four directions free. The
 expected features of a gaze are a table over gaze, smooth between its nodes; the guards look along those
 directions in which frames vary most, in units of their noise, once that expectation is taken off. Two
 directions are left out: along them the gaze itself was chosen to fit.
@@ -44,7 +44,8 @@ def learn(features, gaze_deg, sigma_deg, offset, gain_q12, noise, label=None, ce
     """
     features, gaze = np.asarray(features, float), np.asarray(gaze_deg, float)
     if len(features) < 4:
-        raise CalibrationError(f"{len(features)} frames tell nothing of what to expect", "record more targets")
+        raise CalibrationError(f"{len(features)} frames tell nothing of what to expect",
+                               "record more targets")
     s, _ = quantise(np.clip(np.rint(features), 0, 65535), offset, gain_q12)
     step = (s >> 4).astype(float)
     origin, scale, nodes = _grid(gaze, cells_max)
@@ -100,7 +101,8 @@ def spread(learnt, gp, fixed, rows, gaze_deg):
     known = np.array([place.get((*x, *y), -1) for x, y in zip(fixed.mean, fixed.target)])
     miss = (learnt.y - learnt.loo()[0])[known]
     count = np.bincount(label, minlength=len(known))
-    mean = np.stack([np.bincount(label, g, len(known)) for g in gaze_deg.T], axis=1) / np.maximum(count, 1)[:, None]
+    total = np.stack([np.bincount(label, g, len(known)) for g in gaze_deg.T], axis=1)
+    mean = total / np.maximum(count, 1)[:, None]
     error = np.abs(gaze_deg - mean[label] - miss[label])
     off = np.abs(fixed.target - np.median(fixed.target, axis=0))
     inner = (known[label] >= 0) & (off <= INNER * off.max(axis=0)).all(axis=1)[label]
@@ -144,9 +146,8 @@ def _smooth(blend, nodes, values):
         if len(first):
             entry = np.repeat(np.arange(len(first)), 3)
             at = (first[:, None] + stride * np.arange(3)).ravel()
-            bends.append(
-                sparse.csr_matrix((np.tile([1.0, -2.0, 1.0], len(first)), (entry, at)), (len(first), wide * high))
-            )
+            bend = np.tile([1.0, -2.0, 1.0], len(first))
+            bends.append(sparse.csr_matrix((bend, (entry, at)), (len(first), wide * high)))
     frames = blend.shape[0] / max(1, (wide - 1) * (high - 1))
     normal = blend.T @ blend + 1e-9 * frames * sparse.identity(wide * high)
     for bend in bends:
@@ -155,7 +156,7 @@ def _smooth(blend, nodes, values):
 
 
 def _doubt_of_strangers(blend, nodes, step, row, label):
-    """m of every frame [n], by an expectation that has not seen its fixation: as the device will meet new gazes.
+    """m of every frame [n], by an expectation that has not seen its fixation: as the device meets new gazes.
 
     Where targets stand far apart, that is much more than the doubt of frames that the grid was fitted to.
     """
@@ -172,7 +173,7 @@ def _doubt_of_strangers(blend, nodes, step, row, label):
 
 
 def _directions(miss, spread, label):
-    """Rows [g, d] along which `miss` [n, d] varies most in units of `spread` [d], each to standard deviation 1.
+    """Rows [g, d] along which `miss` [n, d] varies most, in units of `spread` [d], each to deviation 1.
 
     What differs between fixations (pupil, seat) has had minutes to show itself and will go on: it counts
     DRIFT times. What differs within them is noise.
@@ -182,8 +183,8 @@ def _directions(miss, spread, label):
         mean = np.zeros_like(white)
     else:
         _, label = np.unique(label, return_inverse=True)
-        mean = np.stack([np.bincount(label, column) for column in white.T], axis=1) / np.bincount(label)[:, None]
-        mean = mean[label]
+        total = np.stack([np.bincount(label, column) for column in white.T], axis=1)
+        mean = (total / np.bincount(label)[:, None])[label]
     cov = (white - mean).T @ (white - mean) / len(white) + DRIFT * (mean.T @ mean) / len(white)
     variance, direction = np.linalg.eigh(cov)
     free = max(1, min(GUARDS, len(spread) - 2))
@@ -192,7 +193,7 @@ def _directions(miss, spread, label):
 
 
 def _whole(direction, surface):
-    """Integers along a direction: a residual of one deviation is RESIDUAL_SD steps, if row and grid hold that."""
+    """Integers along a direction: a residual's deviation is RESIDUAL_SD steps, if row and grid hold that."""
     size = RESIDUAL_SD
     size = min(size, ROW_MAX / max(np.abs(direction).sum(), 1e-9))
     reach = surface @ direction

@@ -34,7 +34,7 @@ BOOTLOADERS = {                 # name: (start address, file, variable that name
     "atmegaboot": (0x7800, "atmega/ATmegaBOOT_168_atmega328.hex", "SPARSEGAZE_ATMEGABOOT"),
 }
 BOOTLOADER_FOLDERS = (
-    SOURCE_TREE / "tools" / "vheadset" / "build",           # Optiboot from Debian's source: its own build does not fit
+    SOURCE_TREE / "tools" / "vheadset" / "build",    # Optiboot of Debian's source: its build does not fit
     "/usr/share/arduino/hardware/arduino/avr/bootloaders",
     "/usr/local/share/arduino/hardware/arduino/avr/bootloaders",
     "~/.arduino15/packages/arduino/hardware/avr",
@@ -62,8 +62,8 @@ class VirtualNano:
                 physics.toml; a simulated one relative to the default headset
     link        symbolic link to make to the port; replaces an older link, refuses anything else that is there
     truth       CSV to write the eye's true state to
-    physics     {"section.key": value} over the constants of physics.toml; eye.lid_follow_gain acts through the
-                simulated map, so not on a map that is given
+    physics     {"section.key": value} over the constants of physics.toml; eye.lid_follow_gain acts through
+                the simulated map, so not on a map that is given
     progress    handed to the response map's computation
 
     port, control (VirtualControl), pid, entry (registry.Entry)
@@ -188,7 +188,8 @@ def locate_bootloader(name="optiboot", start=None):
         return address, Path(named)
     for folder in BOOTLOADER_FOLDERS:
         base = Path(folder).expanduser()
-        for path in [base / relative, base / Path(relative).name] + sorted(base.glob(f"*/bootloaders/{relative}")):
+        named = [base / relative, base / Path(relative).name]
+        for path in named + sorted(base.glob(f"*/bootloaders/{relative}")):
             if path.is_file():
                 return address, path
     raise VirtualError(f"the stock bootloader {relative} is not installed",
@@ -297,7 +298,7 @@ class _Link:
         if self.made is not None and self._identity() == self.made:
             try:
                 os.unlink(self.path)
-            except OSError:                     # a folder that became read-only: nothing else of ours is in it
+            except OSError:                     # a folder that became read-only: nothing of ours is in it
                 pass
         self.made = None
 

@@ -16,7 +16,7 @@ def headset(repo_root):
 
 @pytest.fixture
 def refused(command_json, headset, tmp_path):
-    """refused(*options): the command must fail in one line and write nothing. Returns (code, error, remedy)."""
+    """refused(*options): the command must fail in a line and write nothing. Returns (code, error, remedy)."""
 
     def run(*options):
         before = sorted(tmp_path.iterdir())

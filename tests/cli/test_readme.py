@@ -24,7 +24,8 @@ def commands_of(text):
 
 def test_every_command_and_option_of_the_readme_exists(readme):
     commands = commands_of(readme)
-    assert {words[0] for words in commands} >= {"doctor", "virtual", "list", "flash", "calibrate", "stream", "info"}
+    named = {words[0] for words in commands}
+    assert named >= {"doctor", "virtual", "list", "flash", "calibrate", "stream", "info"}
     for words in commands:
         told = CliRunner().invoke(cli, [words[0], "--help"])
         assert told.exit_code == 0, words
@@ -67,9 +68,10 @@ def test_the_folders_of_the_tree_exist(readme, repo_root):
 
 
 def test_the_python_example_runs_on_a_virtual_nano(readme, virtual_nano, firmware_hex, tmp_path, capsys):
-    """Verbatim but for the port and an end: 40 frames. The board has no model, so no gaze is valid and none printed."""
+    """Verbatim but for the port and an end: 40 frames. Without a model no gaze is valid, and none printed."""
     example = re.search(r"```python\n(.*?)```", readme, re.S).group(1)
-    nano = virtual_nano(map=synthetic_map(str(tmp_path / "m.sgmap")), person=2, unpaced=True, app=firmware_hex)
+    nano = virtual_nano(map=synthetic_map(str(tmp_path / "m.sgmap")), person=2, unpaced=True,
+                        app=firmware_hex)
     example = example.replace("/dev/ttyUSB0", nano.port)
     assert "device.frames()" in example and nano.port in example
     seen = []

@@ -159,10 +159,10 @@ def test_one_wrong_bit_in_one_gaze_frame_is_found(held_out):
 
 
 def test_a_wrong_flag_in_one_gaze_frame_is_found(held_out):
-    device = FakeDevice(
-        linear_model(),
-        spoil=lambda seq, gaze: gaze._replace(flags=gaze.flags | lib.SG_FLAG_STARVED) if seq == 1500 else gaze,
-    )
+    def spoil(seq, gaze):
+        return gaze._replace(flags=gaze.flags | lib.SG_FLAG_STARVED) if seq == 1500 else gaze
+
+    device = FakeDevice(linear_model(), spoil=spoil)
     assert validate.measure(device, device.screen, held_out).differing == 1
 
 

@@ -25,7 +25,8 @@ def tool(monkeypatch, tmp_path, good):
 def test_table_shows_the_figures_of_the_report(good):
     table = module.table(good)
     assert "simulated person 1" in table and "**0.70** / 0.60 / 1.50 deg" in table
-    for figure in ("640.4 Hz", "18 vectors, gaze alone", "1001.0 Hz; 0", "16010, 0, 0", "64 vectors", "15,900, 22,700 of 24,984 cycles"):
+    for figure in ("640.4 Hz", "18 vectors, gaze alone", "1001.0 Hz; 0", "16010, 0, 0", "64 vectors",
+                   "15,900, 22,700 of 24,984 cycles"):
         assert figure in table
     assert "2.10 ms, 1.25 ms" in table
     assert {line.count("|") for line in table.splitlines()} == {4}
@@ -88,6 +89,7 @@ def test_the_front_ends_table_has_a_row_for_every_bar_and_marks_what_is_missed()
 def test_what_was_not_measured_is_no_zero_in_the_inference_table():
     lids = dict.fromkeys(("shut_flagged", "half_flagged", "narrow_flagged", "false_alarms"), 0.5)
     known = dict(coverage68=0.7, coverage95=None, **lids)
-    row = next(line for line in module.inference_table({"bars": [], "variance": known}).splitlines() if "to the target" in line)
-    assert "| 0.700, - |" in row
-    assert "0.000" not in module.inference_table({"bars": [], "variance": dict(coverage68=None, coverage95=None, **lids)})
+    lines = module.inference_table({"bars": [], "variance": known}).splitlines()
+    assert "| 0.700, - |" in next(line for line in lines if "to the target" in line)
+    unknown = dict(coverage68=None, coverage95=None, **lids)
+    assert "0.000" not in module.inference_table({"bars": [], "variance": unknown})

@@ -7,8 +7,8 @@
 //
 // Invariants: decode never returns more than 64 nor writes beyond; what decodes re-encodes to the same bytes;
 // a receiver is back in step one delimiter after anything; whatever sg_model_open accepts can be predicted
-// from, with any feature; nothing is written to a view that was refused; no reading takes an exposure beyond its
-// limits.
+// from, with any feature; nothing is written to a view that was refused; no reading takes an exposure beyond
+// its limits.
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>

@@ -51,8 +51,8 @@ def test_random_and_damaged_bytes_break_no_invariant(program, seed):
 
 FAULTS = {
     "a decoder that trusts the code byte": (
-        "sg_wire.c", "        if ((size_t)(code - 1U) > (size_t)(end - at))\n            return SG_E_SHORT;\n",
-        ""),
+        "sg_wire.c",
+        "        if ((size_t)(code - 1U) > (size_t)(end - at))\n            return SG_E_SHORT;\n", ""),
     "a decoder that trusts the length": ("sg_wire.c", "byte == 0 || to == full", "byte == 0"),
     "a model opened without its length": ("sg_model.c",
                                           "    if (length > room)\n        return SG_E_SHORT;\n", ""),

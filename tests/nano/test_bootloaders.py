@@ -76,7 +76,7 @@ def test_blank_chip_stays_in_reach_of_the_bootloader():
 
 
 def test_debian_build_of_optiboot_leaves_the_watchdog_running():
-    """Its last 20 bytes lie behind the end of the flash: why tools/vheadset/Makefile builds the same source anew."""
+    """Its last 20 bytes lie behind the flash's end: so tools/vheadset/Makefile builds its source anew."""
     starts = {}
     for path in (OPTIBOOT, BOOTLOADERS / "optiboot" / "optiboot_atmega328.hex"):
         with Board(app=firmware("echo"), bootloader=path, start=0x7E00, auto_reset=1, baud=115200) as board:

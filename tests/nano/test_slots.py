@@ -94,7 +94,7 @@ def test_second_of_a_pair_shares_with_what_the_first_left_on_the_sampler():
 
 
 def test_every_conversion_after_ground_takes_its_share_of_a_node_away(board):
-    """An empty sampler, again and again: the charge on the node and the sampler's is what there was before."""
+    """An empty sampler, again and again: the node's charge and the sampler's are what there was before."""
     slots(board, BANDGAP_CHANNEL, FULL | 1)
     before = board.node(1)[0]
     slots(board, BANDGAP_CHANNEL, FULL | 1, GROUND, FULL | 1, GROUND, FULL | 1)

@@ -3,7 +3,7 @@
 //   NOTHING      it does not
 //   HANG_LOOP    from the 400th cycle on the main loop stands, the sensing engine runs on
 //   HANG_LIT     the same, with interrupts off at a moment when emitters are lit
-//   STRAY        there a jump to address 0, as a smashed stack makes: no reset, but a start from the beginning
+//   STRAY        there a jump to address 0, as a smashed stack makes: no reset, but a start from the top
 //   BLOCK        interrupts are off for 250 us in every 16th cycle, later and later in it
 //   SHORT_BLOCK  the same for 6 us, in every second
 //   SLOW         5 ms of work for cycles that come every millisecond

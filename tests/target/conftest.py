@@ -38,8 +38,8 @@ def costly_model(middle, vectors=64, seed=0):
     """The ordinary model that costs most: all four guards, a grid of 9 x 9, and no kernel that is 0.
 
     middle    [6] features in the middle of its box; the box is 8190 feature steps wide in every channel
-    Its centres lie in the middle fifth of the box, so that no kernel is zero for features within 1000 steps of
-    the middle, and every guard passes there, so that all are computed.
+    Its centres lie in the middle fifth of the box, so that no kernel is zero for features within 1000 steps
+    of the middle, and every guard passes there, so that all are computed.
     """
     rng = np.random.default_rng(seed)
     trust = Trust(row=rng.integers(-10, 11, (4, CHANNELS)), base=np.full(4, -1000), low=np.full(4, -2**15),
@@ -137,7 +137,7 @@ def exchange(device, data, wait_s=0.05):
 
 
 def collect(device, n, timeout_s=2.0):
-    """The next n stream frames, from the first whole one on: a stream may begin in the middle of a frame's packets."""
+    """The next n stream frames, from the first whole one on: a stream may begin amid a frame's packets."""
     frames, parts = [], bin(device._stream_bits).count("1")
     for frame in device.frames(timeout_s):
         if not frames and parts > sum(part is not None for part in (frame.raw, frame.gaze, frame.counts)):

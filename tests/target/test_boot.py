@@ -37,7 +37,7 @@ def test_older_bootloader_starts_and_restarts_the_firmware(board):
 
 
 def test_bytes_that_come_while_it_starts_are_not_counted_lost(board):
-    """The receiver is off until somebody takes its bytes: what came before is nobody's, a half packet at most."""
+    """The receiver is off until somebody takes its bytes: what came before is lost, a half packet at most."""
     nano, device = board(auto_reset=False)
     link = device.link
     for phase in range(12):

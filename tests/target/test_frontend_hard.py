@@ -180,12 +180,13 @@ def test_a_step_of_a_thousand_in_the_middle_of_an_exposure(worn, repeats, least,
 
 @pytest.mark.parametrize("rate_hz, repeats, hz, times", [
     (0, 1, 100.0, 1.4), (0, 1, 120.0, 1.4), (0, 1, 100.1, 1.4), (500, 1, 100.0, 1.5), (250, 1, 120.0, 1.5),
-    (250, 4, 120.0, 1.2), (250, 4, 100.0, 1.2), (100, 1, 101.0, 1.5), (100, 4, 100.3, 1.5), (60, 1, 120.5, 1.5)])
+    (250, 4, 120.0, 1.2), (250, 4, 100.0, 1.2), (100, 1, 101.0, 1.5), (100, 4, 100.3, 1.5),
+    (60, 1, 120.5, 1.5)])
 def test_flicker_and_its_beat_with_the_frame_rate(worn, rate_hz, repeats, hz, times):
     """50 % deep, of the signal's size, against the same light that does not flicker; rate 0: the full one.
 
-    One gaze, whose error is mostly noise: as much larger as crests make exposures shorter. What flicker adds to the
-    error anywhere in the field is a figure of tools/bench/bench_frontend.py, flicker_ratio."""
+    One gaze, whose error is mostly noise: as much larger as crests make exposures shorter. What flicker adds
+    to the error anywhere in the field is a figure of tools/bench/bench_frontend.py, flicker_ratio."""
     one = worn()
     one.device.settings(rate_hz=rate_hz, repeats=repeats)
     one.control.ambient(200.0)
@@ -201,7 +202,8 @@ def test_flicker_and_its_beat_with_the_frame_rate(worn, rate_hz, repeats, hz, ti
     assert not (flags(frames) & lib.SG_FLAG_SATURATED).any()
     assert np.isfinite(found).mean() > 0.95
     shorter = np.exp(np.log(exposure_us / one.device.exposure().exposure_us).mean())
-    print(f"{rate_hz or 'full'} Hz, {hz} Hz: {np.nanmean(found):.3f} deg, steady {steady:.3f}, exposures {shorter:.2f} times")
+    print(f"{rate_hz or 'full'} Hz, {hz} Hz: {np.nanmean(found):.3f} deg, steady {steady:.3f}, "
+          f"exposures {shorter:.2f} times")
     assert 1 / 1.1 < shorter < 1.7 and np.nanmean(found) <= times * shorter * steady
 
 
@@ -323,7 +325,8 @@ def test_a_command_storm_at_full_frame_rate_loses_and_delays_nothing(worn):
     requests = [(lib.SG_MSG_STATUS, b""), (lib.SG_MSG_EXPOSURE, wire.body("struct sg_exposure")),
                 (lib.SG_MSG_PING, wire.body("struct sg_ping", token=7)), (lib.SG_MSG_MODEL_INFO, b""),
                 (lib.SG_MSG_SETTINGS, wire.body("struct sg_settings")), (lib.SG_MSG_HELLO, b""),
-                (lib.SG_MSG_CURVE, wire.body("struct sg_curve")), (lib.SG_MSG_INFER, wire.body("struct sg_infer")),
+                (lib.SG_MSG_CURVE, wire.body("struct sg_curve")),
+                (lib.SG_MSG_INFER, wire.body("struct sg_infer")),
                 (lib.SG_MSG_RECENTRE, wire.body("struct sg_recentre")),
                 (lib.SG_MSG_MODEL_READ, wire.body("struct sg_model_at", length=48))]
     decoder, seen, lost, sent = wire.Decoder(), [], [], 300

@@ -224,7 +224,7 @@ def test_flicker_of_the_signals_size_is_taken_away(board, hz):
     still(nano, device, 0.4)
     frames = frames_of(device, 400)
     found = features(frames).std(axis=0)
-    steady /= device.exposure().exposure_us     # crests ask for shorter exposures, and those for noise as much larger
+    steady /= device.exposure().exposure_us     # crests ask for shorter exposures: noise is as much larger
     print(f"{hz} Hz: RMS {np.round(found, 1)}, in steady light {np.round(steady, 1)} with these exposures")
     assert not (flags_of(frames) & lib.SG_FLAG_SATURATED).any()
     # Three unlit samples predict the fourth: at most sqrt(3) of its noise beside the lit one's.
@@ -248,7 +248,7 @@ def test_exposures_do_not_hunt(board):
 
 @pytest.mark.parametrize("gap_us", [3000, 5000, 7000])
 def test_exposures_that_never_rest_find_their_place_when_the_light_does(board, gap_us):
-    """What was in force while changes were on their way is no limit of the port's: one channel stayed full for ever."""
+    """What was in force while changes were on their way is no limit of the port's: a channel stayed full."""
     nano, device = board(models={0: random_model(15, seed=1).image})
     still(nano, device)
     device.set_stream(raw=True, gaze=True)

@@ -28,12 +28,13 @@ def head_at(field):
 def flat_model(middle):
     """A model whose range is 1000 steps (a quarter octave) around six features either way."""
     return DeviceModel.from_parts(
-        offset=np.asarray(middle, int) - 1000, gain_q12=[4095 * 4096 // 2000] * 6, bias=[0, 0], trend=np.zeros((2, 6), int),
-        centres=np.full((1, 6), 128), weights=np.zeros((1, 2), int), weight_frac_bits=8, generation=1)
+        offset=np.asarray(middle, int) - 1000, gain_q12=[4095 * 4096 // 2000] * 6, bias=[0, 0],
+        trend=np.zeros((2, 6), int), centres=np.full((1, 6), 128), weights=np.zeros((1, 2), int),
+        weight_frac_bits=8, generation=1)
 
 
 def host_gaze(model, features, recentre_deg=(0.0, 0.0), gain=None):
-    """[n, 4] integers azimuth, elevation (1/128 deg), flags, sigma's code, as the host's core computes them."""
+    """[n, 4] integers azimuth, elevation (1/128 deg), flags, sigma's code, as the host's core has them."""
     affine = np.array(tuple(wire.affine(recentre_deg, gain)), replay.AFFINE)
     gazes = replay.infer(model, features, recentre=affine)
     return np.column_stack([*gazes]).astype(np.int32)
@@ -112,7 +113,7 @@ def test_frames_within_31_ms_after_one_out_of_range_are_recovering_and_not_valid
     assert sum(out) > 20 and last < 100
     moving = lib.SG_FLAG_SATURATED | lib.SG_FLAG_STARVED | lib.SG_FLAG_EXPOSURE
     steps = [frame.t_us >> 8 for frame in frames]       # 256 us: what the device counts in
-    # What a frame out of range in settled light holds back: two frames, and 31 ms once that has lasted for 11.
+    # What a frame out of range in settled light holds back: two frames, and 31 ms once that has lasted 11.
     holds, since = [], None
     for frame, before, step, was_out in zip(frames, [steps[0] - 99, *steps], steps, out):
         since = None if not was_out or frame.raw.flags & moving else before if since is None else since
@@ -268,7 +269,8 @@ def test_any_correction_is_bit_identical_and_saturates_instead_of_wrapping(board
     with QemuBoard(model.image) as cortex_m4, Device(cortex_m4) as other:
         for each in (device, other):
             assert each.recentre(offset, gain).affine == wire.affine(offset, gain)
-            np.testing.assert_array_equal(device_gaze(each, features), host_gaze(model, features, offset, gain))
+            expected = host_gaze(model, features, offset, gain)
+            np.testing.assert_array_equal(device_gaze(each, features), expected)
 
 
 def test_every_gain_of_the_wire_is_legal_also_the_most_negative(board):
@@ -292,7 +294,8 @@ def eeprom_record(size, version_at, version, sequence=5):
 
 
 @pytest.mark.parametrize("size, place, version", [(24, 0, 1), (28, 56, 2), (52, 120, 77)])
-def test_a_live_state_of_another_version_is_not_read_and_a_fresh_one_begun(board, tmp_path, size, place, version):
+def test_a_live_state_of_another_version_is_not_read_and_a_fresh_one_begun(
+        board, tmp_path, size, place, version):
     state = tmp_path / "state"
     state.mkdir()
     other = eeprom_record(size, 27 if size > 24 else 23, version)

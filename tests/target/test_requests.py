@@ -87,7 +87,8 @@ def test_longer_body_is_accepted_and_its_excess_ignored(board, kind):
     (lib.SG_MSG_TRIAL_USE, b"\x02", lib.SG_E_ARG),
     (lib.SG_MSG_EXPOSURE, bytes(12) + b"\x05\0", lib.SG_E_ARG),
     (lib.SG_MSG_RECENTRE, bytes(8) + b"\x03\0", lib.SG_E_ARG),
-    (lib.SG_MSG_CURVE, bytes(7) + b"\x02", lib.SG_E_ARG), (lib.SG_MSG_CURVE, bytes(6) + b"\1\1", lib.SG_E_ARG),
+    (lib.SG_MSG_CURVE, bytes(7) + b"\x02", lib.SG_E_ARG),
+    (lib.SG_MSG_CURVE, bytes(6) + b"\1\1", lib.SG_E_ARG),
     (lib.SG_MSG_SETTINGS, bytes(8) + b"\x02" + bytes(5), lib.SG_E_ARG),
     (lib.SG_MSG_PROBE, b"\x06", lib.SG_E_ARG),
     (lib.SG_MSG_RECENTRE, bytes(8) + b"\x01\0", lib.SG_E_STATE),
@@ -208,7 +209,7 @@ def test_answers_survive_a_flood_and_dropped_frames_are_counted(board):
     missing = 3 * sensed - len(streamed)
     status = device.status()
     assert status.tx_dropped > 0 and status.rx_overrun == 0
-    # Frames at both ends of the observation may be counted and not seen; frames never taken up are counted as late.
+    # Frames at both ends of the observation may be counted and not seen; those never taken up count as late.
     assert -3 * status.late_frames <= status.tx_dropped - missing <= 3 * 30
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings: rate and its limit, repeats, power, lights, exposures' limits, curves, probes; what survives power."""
+"""Settings: rate and its limit, repeats, power, lights, exposures' limits, curves, probes; what is kept."""
 
 import itertools
 
@@ -22,7 +22,7 @@ def hertz_of(frames):
 
 
 def settled(device, n):
-    """n stream frames in a row, from when boot and the change of settings are over (with all their requests)."""
+    """n stream frames in a row, once boot and the change of settings are over (with all their requests)."""
     device.link.sleep(0.3)
     begin_us, frames = device.status().t_us + 300_000, []
     for frame in device.frames():
@@ -91,7 +91,8 @@ def test_slower_frames_have_more_cycles_without_a_gap_and_with_low_power_dark_be
     low = device.settings(power="low")
     assert low.period_us == 999 and low.frame_period_us == 4000 and low.power == lib.SG_POWER_LOW
     frames = settled(device, 30)
-    assert max(frame.raw.span_us for frame in frames) < 600 and hertz_of(frames) == pytest.approx(250, rel=2e-3)
+    assert max(frame.raw.span_us for frame in frames) < 600
+    assert hertz_of(frames) == pytest.approx(250, rel=2e-3)
     calm(device)
 
 
@@ -161,7 +162,8 @@ def test_the_limit_follows_the_streams_and_the_line_and_the_wish_is_kept(board):
     _, device = board(models={0: random_model(64).image})
     device.settings(rate_hz=900)
     limit = {}
-    for streams in ({}, {"gaze": True}, {"raw": True, "gaze": True}, {"raw": True, "gaze": True, "counts": True}):
+    for streams in ({}, {"gaze": True}, {"raw": True, "gaze": True},
+                    {"raw": True, "gaze": True, "counts": True}):
         device.set_stream(**streams)
         now = device.settings()
         limit[len(streams)] = now.rate_limit_hz
@@ -189,8 +191,8 @@ def test_no_frame_is_late_with_any_model_streams_and_repeats(board, vectors):
             device.link.sleep(0.25)
             work = nano.control.markers()["5"]
             room = 16 * (now.frame_period_us - (repeats - 1) * now.period_us)
-            print(f"{vectors} vectors, {streams}, {repeats} repeats: {work.mean:.0f} (most {work.most:.0f}) of {room} "
-                  f"cycles, limit {now.rate_limit_hz} Hz")
+            print(f"{vectors} vectors, {streams}, {repeats} repeats: {work.mean:.0f} (most {work.most:.0f}) "
+                  f"of {room} cycles, limit {now.rate_limit_hz} Hz")
             assert work.mean <= room
             if any(streams.values()):
                 settled(device, 100)            # and none is lost
@@ -263,8 +265,9 @@ def test_a_probe_lights_one_emitter_alone_and_all_is_as_before_afterwards(board)
 
 def test_probes_are_refused_in_the_dark_and_one_at_a_time(board):
     _, device = board()
-    packets = exchange(device, wire.encode(lib.SG_MSG_PROBE, 1, b"\1") + wire.encode(lib.SG_MSG_PROBE, 2, b"\2"))
-    assert sorted((p.seq, p.type) for p in packets) == [(1, lib.SG_MSG_PROBE | lib.SG_REPLY), (2, lib.SG_MSG_ERROR)]
+    asked = wire.encode(lib.SG_MSG_PROBE, 1, b"\1") + wire.encode(lib.SG_MSG_PROBE, 2, b"\2")
+    answers = sorted((packet.seq, packet.type) for packet in exchange(device, asked))
+    assert answers == [(1, lib.SG_MSG_PROBE | lib.SG_REPLY), (2, lib.SG_MSG_ERROR)]
     assert wire.parse_error(packets[0].body) == (lib.SG_E_BUSY, lib.SG_MSG_PROBE)
     device.settings(lights=False)
     with pytest.raises(DeviceError) as caught:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Any function of the core on a Cortex-M4 in QEMU, over given inputs: its bytes and its instructions.
 
-    result = run_cases(tmp_path, "*(uint16_t *)out = sg_expose_from_us_q4(*(const uint16_t *)in);", inputs=rows,
-                       out_bytes=2, includes=["sg_expose.h"])
+    result = run_cases(tmp_path, "*(uint16_t *)out = sg_expose_from_us_q4(*(const uint16_t *)in);",
+                       inputs=rows, out_bytes=2, includes=["sg_expose.h"])
 
 The program is the core, the start-up of firmware/ports/mps2an386 and a main made here. QEMU counts
 instructions, not cycles.

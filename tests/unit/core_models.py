@@ -15,7 +15,7 @@ LEVEL = np.array([min(65535, math.floor(65536 * math.exp(-i / 64))) for i in ran
 
 @dataclass
 class Parts:
-    """Everything a model holds, as integers. n vectors, d channels, g guards, a grid of [high, wide] nodes."""
+    """All that a model holds, as integers. n vectors, d channels, g guards, a grid of [high, wide] nodes."""
     offset: np.ndarray          # [d] feature units
     gain_q12: np.ndarray        # [d]
     bias: np.ndarray            # [2]
@@ -55,8 +55,9 @@ class Parts:
         head.magic, head.version, head.vectors, head.channels = lib.SG_MODEL_MAGIC, 2, n, d
         grid = b""
         page.nodes = [self.sigma.shape[1], self.sigma.shape[0]]
-        for sigma, expected in zip(self.sigma.ravel(), self.expected.reshape(self.sigma.size, len(self.guard))):
-            grid += bytes(int(v) for v in expected) + bytes(4 - len(self.guard)) + bytes([int(sigma)])
+        guards = len(self.guard)
+        for sigma, expected in zip(self.sigma.ravel(), self.expected.reshape(self.sigma.size, guards)):
+            grid += bytes(int(v) for v in expected) + bytes(4 - guards) + bytes([int(sigma)])
         head.generation, head.length = self.generation, 256 + len(grid) + 12 * n
         head.weight_frac_bits = self.weight_frac_bits
         head.bias = [int(v) for v in self.bias]
@@ -121,8 +122,8 @@ def kernel(parts, s):
 
 
 def twin(parts, feature):
-    """The device's answer: deg_q7 int64 [count, 2] before it saturates, flagged bool [count] by ranges, guards and
-    doubt (not by saturation), doubt [count], sigma [count] as if the angles had not saturated."""
+    """The device's answer: deg_q7 int64 [count, 2] before it saturates, flagged bool [count] by ranges,
+    guards and doubt (not by saturation), doubt [count], sigma [count] as if the angles had not saturated."""
     s, outside = scaled(parts, feature)
     acc = (parts.bias + s @ parts.trend.T.astype(np.int64)) >> 4
     k = kernel(parts, s)
@@ -188,12 +189,12 @@ class View:
         self.verdict = lib.sg_model_open(self.view, self.bytes, len(image), 0)
 
     def predict(self, feature):
-        """sg_gp_predict over uint16 [count, 6]: deg_q7 int64 [count, 2], flags [count], results [count], doubt
-        [count], sigma [count]."""
+        """sg_gp_predict over uint16 [count, 6]: deg_q7 int64 [count, 2], flags [count], results [count],
+        doubt [count], sigma [count]."""
         point = ffi.new("struct sg_gp_point *")
         rows = []
         for row in np.ascontiguousarray(feature, np.uint16):
             result = lib.sg_gp_predict(self.view, ffi.from_buffer("uint16_t[]", row), point)
-            rows.append((point.deg_q7[0], point.deg_q7[1], point.flags, result, point.doubt, point.sigma_log2_q4))
+            rows.append((*point.deg_q7, point.flags, result, point.doubt, point.sigma_log2_q4))
         table = np.array(rows, np.int64).reshape(-1, 6)
         return table[:, :2], table[:, 2], table[:, 3], table[:, 4], table[:, 5]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sensing chain in float64, independent of the core: photocurrents to ADC codes, and codes to photocurrents.
+"""The sensing chain in float64, independent of the core: photocurrents to ADC codes, codes to photocurrents.
 
-The charge balance is that of physics.toml's node on a rail of 1.8 V, in closed form; nothing here is a polynomial.
-Currents in nA, charges in pC, exposures in timer cycles of 1/16 us, codes of 1.1 V / 1024.
+The charge balance is that of physics.toml's node on a rail of 1.8 V, in closed form; nothing here is a
+polynomial. Currents in nA, charges in pC, exposures in timer cycles of 1/16 us, codes of 1.1 V / 1024.
 """
 import numpy as np
 
@@ -60,7 +60,8 @@ def true_feature(current_na):
 def feature_noise(signal_na, lit_code, unlit_share, cycles, neighbour=False, repeats=1):
     """Standard deviation of a feature from the codes' random errors, analytic.
 
-    unlit_share: variance of the unlit code meant over that of one code (1 alone, 1/31 at rest, 0.68 interpolated).
+    unlit_share: variance of the unlit code meant over that of one code: 1 alone, 1/31 at rest,
+    0.68 interpolated.
     neighbour: the second of a pair carries its share of the first one's errors too."""
     noise = np.sqrt(NOISE_LSB ** 2 + 1 / 12)
     slope_pc = (node_pc(lit_code + 0.5) - node_pc(lit_code - 0.5))

@@ -92,7 +92,7 @@ def test_a_step_that_never_settles_has_no_number_of_frames(bench):
 def test_a_step_is_settled_when_frames_are_valid_as_often_as_later(bench):
     frames, error = np.zeros(1000, bench.board.FRAME), np.full(1000, 0.5)
     since = np.arange(1000) % 100
-    error[(since < 8) & (np.arange(1000) // 100 % 5 == 0)] = np.nan     # a fifth of the steps, eight frames long
+    error[(since < 8) & (np.arange(1000) // 100 % 5 == 0)] = np.nan     # a fifth of the steps, 8 frames long
     error[since % 25 == 24] = np.nan                                    # for ever
     assert bench.measures.judge_steps(frames, error, np.arange(0, 1000, 100))["settle_frames"] == 8
 

@@ -111,7 +111,8 @@ def test_extremes_of_the_distance_and_of_every_operand_are_bit_identical(bench_d
                   weight=np.array(weights), weight_frac_bits=5,
                   guard=[(-14336, -2 ** 15, 2 ** 15 - 1, np.array([-12, 17, -1, 1, 0, -32])),
                          (14336, -12 * 10 ** 3, 4 * 10 ** 3, np.array([-63, 0, 0, 0, 0, 0])),
-                         (0, -2 ** 15, 2 ** 15 - 1, np.zeros(6, int)), (3, -4, 5, np.array([0, 0, 63, 0, 0, 0]))],
+                         (0, -2 ** 15, 2 ** 15 - 1, np.zeros(6, int)),
+                         (3, -4, 5, np.array([0, 0, 63, 0, 0, 0]))],
                   expected=np.arange(20 * 20 * 4).reshape(20, 20, 4) % 256,
                   sigma=1 + np.arange(20 * 20).reshape(20, 20) % 255, origin=(-16384, 16384), scale=(255, 1),
                   limit=64515, sigma_gain=255)

@@ -55,7 +55,7 @@ def mlp_case():
 
 
 def light_case():
-    """Ordinary cycles, the costliest: light that moves, interpolated, the state settled before, on the host."""
+    """Ordinary cycles, the costliest: light that moves, interpolated; the state was settled on the host."""
     rng = np.random.default_rng(4)
     wave = np.round(150 + 15 * np.sin(0.69 * np.arange(80)))[:, None]
     codes = np.concatenate([wave + rng.integers(150, 600, (80, 6)), wave + rng.integers(-1, 2, (80, 6)),
@@ -67,8 +67,10 @@ def light_case():
         ffi.memmove(reading, row.tobytes(), 50)
         lib.sg_light_add(light, reading)
         lib.sg_light_features(light, feature)
-    return {"body": "struct sg_reading reading; memcpy(&reading, in, sizeof reading); sg_light_add(&light, &reading);"
-                    "uint16_t feature[6]; out[12] = sg_light_features(&light, feature); memcpy(out, feature, 12);",
+    return {"body": "struct sg_reading reading; memcpy(&reading, in, sizeof reading);"
+                    "sg_light_add(&light, &reading);"
+                    "uint16_t feature[6]; out[12] = sg_light_features(&light, feature);"
+                    "memcpy(out, feature, 12);",
             "inputs": codes[40:], "out_bytes": 13, "includes": ["sg_light.h", "sg_rom.h"],
             "setup": "static struct sg_light light; for (uint8_t k = 0; k < sizeof light; k++)"
                      "    ((uint8_t *)&light)[k] = sg_rom_byte(&settled[k], CASE_SPACE);",
@@ -78,8 +80,8 @@ def light_case():
 def expose_case():
     """Ordinary cycles: nothing full, nothing to acquire."""
     rng = np.random.default_rng(5)
-    codes = np.concatenate([rng.integers(300, 350, (60, 6)), rng.integers(2, 9, (60, 6)), np.tile(EXPOSURES, (60, 1))],
-                           axis=1)
+    codes = np.concatenate([rng.integers(300, 350, (60, 6)), rng.integers(2, 9, (60, 6)),
+                            np.tile(EXPOSURES, (60, 1))], axis=1)
     expose = ffi.new("struct sg_expose *")
     lib.sg_expose_start(expose, EXPOSURES, EXPOSURES)
     for _ in range(20):

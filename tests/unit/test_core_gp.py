@@ -7,7 +7,8 @@ import zlib
 import numpy as np
 import pytest
 
-from core_models import LEVEL, Parts, View, bound_deg, features_near, random_parts, real_mean_deg, scaled, twin
+from core_models import (LEVEL, Parts, View, bound_deg, features_near, random_parts, real_mean_deg, scaled,
+                         twin)
 from sparsegaze._core import ffi, lib
 
 GOLDEN_CRC = 0xDB4265E1     # see test_golden_crc_of_64_predictions
@@ -113,12 +114,14 @@ def test_rounds_half_up_at_both_signs():
     for frac in (5, 9):
         half = 1 << (frac + 4)      # of 1/128 deg, in units of the bias
         for bias, expected in ((half, 1), (half - 1, 0), (-half, 0), (-half - 1, -1), (0, 0)):
-            parts = one_channel(bias=np.array([bias, -bias]), weight=np.zeros((1, 2), int), weight_frac_bits=frac)
+            parts = one_channel(bias=np.array([bias, -bias]), weight=np.zeros((1, 2), int),
+                                weight_frac_bits=frac)
             assert agree(parts, np.zeros((1, 6), np.uint16))[0, 0] == expected
 
 
 def test_saturates_at_both_ends_and_says_so():
-    for bias, expected in ((2 ** 26 - 1, 32767), (-2 ** 26, -32768), (32767 << 10, 32767), (-32768 << 10, -32768)):
+    for bias, expected in ((2 ** 26 - 1, 32767), (-2 ** 26, -32768),
+                           (32767 << 10, 32767), (-32768 << 10, -32768)):
         parts = one_channel(bias=np.array([bias, 0]), weight=np.zeros((1, 2), int))
         assert agree(parts, np.zeros((1, 6), np.uint16))[0, 0] == expected
 
@@ -159,7 +162,8 @@ def test_real_number_mean_within_the_stated_bound(seed):
 def judged(**more):
     """A model whose gaze is 0 deg everywhere, so that only trust is at work; s = feature."""
     return Parts(offset=np.zeros(6, int), gain_q12=np.full(6, 4096), bias=np.zeros(2, int),
-                 trend=np.zeros((2, 6), int), centre=np.zeros((1, 6), int), weight=np.zeros((1, 2), int), **more)
+                 trend=np.zeros((2, 6), int), centre=np.zeros((1, 6), int), weight=np.zeros((1, 2), int),
+                 **more)
 
 
 def test_guard_ranges_hold_at_their_limits_and_fail_one_step_beyond():
@@ -199,8 +203,9 @@ def test_every_place_of_the_grid_and_far_beyond_it():
     guard = [(0, -2 ** 15, 2 ** 15 - 1, np.array([3, 0, 0, 0, 0, 0]))]
     for nodes, scale, origin in (((2, 2), (1, 255), (-14000, 16384)), ((24, 3), (255, 20), (-16384, -900)),
                                  ((5, 7), (64, 64), (-1280, -1536))):
-        parts = judged(guard=guard, expected=rng.integers(0, 256, (*nodes, 1)), sigma=rng.integers(0, 256, nodes),
-                       origin=origin, scale=scale, limit=20000, sigma_gain=9)
+        parts = judged(guard=guard, expected=rng.integers(0, 256, (*nodes, 1)),
+                       sigma=rng.integers(0, 256, nodes), origin=origin, scale=scale, limit=20000,
+                       sigma_gain=9)
         parts.trend = np.array([[3000, 0, 0, 0, 0, 0], [0, 3000, 0, 0, 0, 0]])
         parts.bias = np.array([-6000 * 1024, -6000 * 1024])
         parts.weight_frac_bits = 5

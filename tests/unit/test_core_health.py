@@ -9,8 +9,8 @@ from sparsegaze._core import ffi, lib
 PATIENCE, OCTAVE = lib.SG_HEALTH_PATIENCE, 4096
 ABOVE = 3 * OCTAVE // 2        # the middle of the range
 OFFSET, GAIN_Q12 = 40000, 2048              # the calibrated range: 40000 .. 48192
-GOOD = {"lit_code": 400, "unlit_code": 3, "before_code": 380, "exposure_cycles": CAPS[0], "most_cycles": CAPS[0],
-        "feature": 44000, "offset": OFFSET, "gain_q12": GAIN_Q12}
+GOOD = {"lit_code": 400, "unlit_code": 3, "before_code": 380, "exposure_cycles": CAPS[0],
+        "most_cycles": CAPS[0], "feature": 44000, "offset": OFFSET, "gain_q12": GAIN_Q12}
 
 
 class Health:

@@ -16,11 +16,11 @@ from sparsegaze._core import ffi, lib
 WIRE_LAYOUT = {1: "55aa88f91cd2ff83", 2: "0b880ed727b526c8", 3: "b74f6aafbe6ef6a9"}
 MODEL_LAYOUT = {1: "8170e606b7f66b46", 2: "0d58657c5f8ead6c"}
 
-STRUCTS = ("sg_head", "sg_hello", "sg_status", "sg_ping", "sg_pong", "sg_mode", "sg_infer", "sg_affine", "sg_gaze",
-           "sg_raw", "sg_counts", "sg_model_info", "sg_model_at", "sg_model_data", "sg_model_verdict",
-           "sg_exposure",
-           "sg_recentre", "sg_error", "sg_model_head", "sg_model_guard", "sg_model_trust", "sg_link_rx", "sg_expose_led", "sg_expose",
-           "sg_light", "sg_light_channel", "sg_reading", "sg_health", "sg_health_sight", "sg_settings", "sg_curve", "sg_probe")
+STRUCTS = ("sg_head", "sg_hello", "sg_status", "sg_ping", "sg_pong", "sg_mode", "sg_infer", "sg_affine",
+           "sg_gaze", "sg_raw", "sg_counts", "sg_model_info", "sg_model_at", "sg_model_data",
+           "sg_model_verdict", "sg_exposure", "sg_recentre", "sg_error", "sg_model_head", "sg_model_guard",
+           "sg_model_trust", "sg_link_rx", "sg_expose_led", "sg_expose", "sg_light", "sg_light_channel",
+           "sg_reading", "sg_health", "sg_health_sight", "sg_settings", "sg_curve", "sg_probe")
 
 
 def layout_hash(header):

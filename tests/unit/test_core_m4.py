@@ -45,8 +45,9 @@ def test_random_models_are_bit_identical(tmp_path, d, n):
 def test_features_and_exposures_of_readings_are_bit_identical(tmp_path):
     rows = np.array([lit + [code >> 2 for code in lit] + exposure for lit, exposure in READINGS], np.uint16)
     result = m4.run_cases(
-        tmp_path, "struct sg_reading reading = { .held_code = 0 }; uint16_t feature[6]; memcpy(&reading, in, 36);"
-        "sg_light_add(&light, &reading); out[0] = sg_light_features(&light, feature); memcpy(out + 1, feature, 12);"
+        tmp_path, "struct sg_reading reading = { .held_code = 0 }; uint16_t feature[6];"
+        "memcpy(&reading, in, 36); sg_light_add(&light, &reading);"
+        "out[0] = sg_light_features(&light, feature); memcpy(out + 1, feature, 12);"
         "sg_expose_cycle(&expose, &reading, 0);"
         "for (int i = 0; i < 6; i++) memcpy(out + 13 + 2 * i, &expose.led[i].exposure_cycles, 2);",
         rows, 25, ["sg_expose.h", "sg_light.h"],

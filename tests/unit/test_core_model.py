@@ -111,7 +111,8 @@ def test_a_length_that_does_not_fit_the_vectors_is_refused(length):
 
 
 @pytest.mark.parametrize("name,values", [
-    ("channels", (0, 7, 255)), ("kernel", (1, 255)), ("weight_frac_bits", (0, 4, 10, 255)), ("pad", (1, 128))])
+    ("channels", (0, 7, 255)), ("kernel", (1, 255)), ("weight_frac_bits", (0, 4, 10, 255)),
+    ("pad", (1, 128))])
 def test_a_head_field_outside_its_range_is_refused_under_a_good_crc(name, values):
     for value in values:
         assert verdict(changed(image(), HEAD[name], value)) == lib.SG_E_BOUNDS, value
@@ -134,7 +135,8 @@ def test_biases_origins_bases_and_rows_hold_at_their_limits_and_fail_one_step_be
                 raw = (sign * value).to_bytes(size, "little", signed=True)
                 assert verdict(changed(data, at, *raw)) == expected, (at, sign * value)
     for row, expected in (([63, 0, 0, 0, 0, 0], lib.SG_OK), ([0, 0, -63, 0, 0, 0], lib.SG_OK),
-                          ([64, 0, 0, 0, 0, 0], lib.SG_E_BOUNDS), ([-11, 11, -11, 11, -11, 9], lib.SG_E_BOUNDS),
+                          ([64, 0, 0, 0, 0, 0], lib.SG_E_BOUNDS),
+                          ([-11, 11, -11, 11, -11, 9], lib.SG_E_BOUNDS),
                           ([-128] * 6, lib.SG_E_BOUNDS)):
         assert verdict(changed(data, 128 + GUARD["row"], *[v & 255 for v in row])) == expected, row
 

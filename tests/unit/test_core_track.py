@@ -26,8 +26,10 @@ def infer(view, feature, raw_flags=0, recentre=(0, 0), gain=(0, 0, 0, 0)):
     ffi.memmove(out, b"\xAA" * 12, 12)
     result = lib.sg_track_infer(view, [int(x) for x in feature], raw_flags, affine, out)
     assert out.t_us == out.infer_us == 0    # nothing of the old frame is left
-    unknown = view == ffi.NULL
-    assert out.sigma_log2_q4 == (0 if unknown else 255 if out.flags & lib.SG_FLAG_OUT_OF_RANGE else out.sigma_log2_q4)
+    if view == ffi.NULL:
+        assert out.sigma_log2_q4 == 0
+    elif out.flags & lib.SG_FLAG_OUT_OF_RANGE:
+        assert out.sigma_log2_q4 == 255
     return result, (out.azimuth_deg_q7, out.elevation_deg_q7), out.flags
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""trustfit.py: what lies on the surface of features is trusted, what leaves it inside every channel's range is not.
+"""trustfit.py: what lies on the surface of features is trusted, what leaves it within all ranges is not.
 
 Features are a smooth function of gaze, made up here; no eye and no person.
 """
@@ -26,7 +26,7 @@ def surface(gaze):
 
 
 def frames(rng, targets, each):
-    """(features, gaze, label) of `each` frames at every target [k, 2], with noise and a drift per fixation."""
+    """(features, gaze, label), `each` frames at every target [k, 2], with noise and a drift per fixation."""
     label = np.repeat(np.arange(len(targets)), each)
     gaze = targets[label]
     drift = rng.normal(0, NOISE, (len(targets), 1)) * np.ones(6)
@@ -55,7 +55,8 @@ def test_new_gazes_on_the_surface_are_trusted(learnt):
     assert outside.mean() < 0.01
 
 
-@pytest.mark.parametrize("channels, steps", [((0,), 1500), ((2, 3), 1500), ((0, 2, 4), 600), ((1, 3, 5), 600)])
+@pytest.mark.parametrize("channels, steps",
+                         [((0,), 1500), ((2, 3), 1500), ((0, 2, 4), 600), ((1, 3, 5), 600)])
 def test_what_leaves_the_surface_inside_the_box_is_refused(learnt, channels, steps):
     trust, rng = learnt
     features, gaze, _ = frames(rng, rng.uniform(-15, 15, (200, 2)), 3)

@@ -180,7 +180,8 @@ def worst(rows):
     # An error or a noise of frames that hardly ever are valid would be none.
     out["valid_nominal"] = min(row["precision"]["nominal"]["valid"] for row in rows)
     out["valid_flicker_250"] = min(row["flicker_250"][hz]["valid"] for row in rows for hz in ("100", "120"))
-    judged = [[row["precision"]["nominal"], *row["ambient_250"].values(), *row["flicker_250"].values()] for row in rows]
+    judged = [[row["precision"]["nominal"], *row["ambient_250"].values(), *row["flicker_250"].values()]
+              for row in rows]
     out["places"] = min(found["places"] for tables in judged for found in tables)
     return out
 

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// Inference on an ATmega328P, for the benchmark: one model in flash, features in by GPIOR2, gazes out by GPIOR1.
+// Inference on an ATmega328P, for the benchmark: one model in flash, features in by GPIOR2, gazes by GPIOR1.
 //
 // Input: the number of rows as two bytes, then six features of two bytes a row, little endian. Output: a byte
-// of sg_model_open's verdict, then struct sg_gaze for each row. GPIOR0 marks section 0: features in to gaze out.
-// case_model.h is made by inference_cycles.py: the model's image.
+// of sg_model_open's verdict, then struct sg_gaze for each row. GPIOR0 marks section 0: features in to gaze
+// out. case_model.h is made by inference_cycles.py: the model's image.
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <avr/pgmspace.h>

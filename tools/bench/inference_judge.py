@@ -88,11 +88,11 @@ def judge_variance(data, model, gp_deg, gp_std, noise_deg):
     """What a model knows of what it does not know, on a DataSet: a dict.
 
     gp_deg [n, 2], gp_std [n], noise_deg    the float64 process at every held-out row, and its noise
-    Of judged rows with open lids: coverage() of errors to the targets, which is what sigma promises (None when
-    the model gives none); with truth_ before the names of errors to the true gaze, and sorted_error_ratio().
-    Of the process the same: gp64_ with its noise in sigma, and gp64_truth_ without. Of settled frames: shut, half, narrow
-    _frames and _flagged by the lids' opening, blink_flagged, the error of blinks not flagged, false_alarms
-    (open lids, flagged).
+    Of judged rows with open lids: coverage() of errors to the targets, which is what sigma promises (None
+    when the model gives none); with truth_ before the names of errors to the true gaze, and
+    sorted_error_ratio(). Of the process the same: gp64_ with its noise in sigma, and gp64_truth_ without. Of
+    settled frames: shut, half, narrow _frames and _flagged by the lids' opening, blink_flagged, the error of
+    blinks not flagged, false_alarms (open lids, flagged).
     """
     device, passed, sigma = answers(data, model)
     truth = data.truth

@@ -63,8 +63,9 @@ def sources_of(module):
 def fitted(folder, data, n_vectors):
     """{image, gp_deg, gp_std, noise_deg, spread, seconds} of a data set's fit to so many vectors.
 
-    gp_deg [n, 2] and gp_std [n]: the float64 process at every held-out row, and its noise_deg; spread (features
-    [k, d], gaze_deg [k, 2]): the rows that it was given, moved frames among them. gp_std and spread at DEFAULT_N only.
+    gp_deg [n, 2] and gp_std [n]: the float64 process at every held-out row, and its noise_deg; spread
+    (features [k, d], gaze_deg [k, 2]): the rows that it was given, moved frames among them. gp_std and spread
+    at DEFAULT_N only.
     """
     words = data.key["hash"], n_vectors, inference_cycles.core_hash()
 

@@ -6,8 +6,9 @@
 Each person is calibrated as the product does it (120 targets) and judged on held-out targets. Then the
 headset moves by so many mm, in a direction drawn per person, the power is cycled, and the same model is
 judged again: as it is, after `recentre` with one point, and with five. All of it is the shipped firmware on
-the virtual Nano; a slip is another response map. Held-out targets are the same in all runs of a person and none of the points.
-Errors are mean angles to the target per frame, over targets within +-20 deg; loss is what had no valid gaze.
+the virtual Nano; a slip is another response map. Held-out targets are the same in all runs of a person and
+none of the points. Errors are mean angles to the target per frame, over targets within +-20 deg; loss is what
+had no valid gaze.
 """
 
 import argparse

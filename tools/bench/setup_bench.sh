@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 # Installs what only the benchmarks' peers need: .venv-bench with the packages of requirements-bench.txt, by
 # hash (Mitsuba 3 for bench-sim; scikit-learn, m2cgen, emlearn and micromlgen for bench-inference), and
-# Debian's libllvm19, with which alone Mitsuba 3.9 runs. `make setup` and `make test` never come here. A second
-# run does nothing.
+# Debian's libllvm19, with which alone Mitsuba 3.9 runs. `make setup` and `make test` never come here. A
+# second run does nothing.
 #
 #   usage: sh tools/bench/setup_bench.sh [--without-llvm]     what bench-inference needs; no apt
 #
@@ -45,8 +45,8 @@ fi
 say "installing the packages of requirements-bench.txt into $venv"
 "$python" -m venv --clear $venv
 printf "*\n" >$venv/.gitignore
-# micromlgen has no wheel. It is built with the pinned setuptools, which therefore comes first: pip's own build
-# environment would fetch one without a hash.
+# micromlgen has no wheel. It is built with the pinned setuptools, which therefore comes first: pip's own
+# build environment would fetch one without a hash.
 awk '/^[a-z]/ { own = /^setuptools==/ } own' requirements-bench.txt >build/setup/bench-first.txt
 install() {
     $venv/bin/python -m pip install -qq --disable-pip-version-check --no-input --only-binary :all: \
