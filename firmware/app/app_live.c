@@ -72,7 +72,8 @@ void app_live_changed(void)
 
 SELDOM static void keep_exposures(void)
 {
-    app_exposures(app_live.exposure_cycles);
+    if (!app.exposure_auto)             // those that move by themselves are kept in their own time
+        app_exposures(app_live.exposure_cycles);
     app_live.exposure_auto = app.exposure_auto;
     dirty = 1;
 }
@@ -101,7 +102,8 @@ SELDOM static void look(void)
         return;
     looks = 1;
     if (app_exposures_far(app_live.exposure_cycles, 3)) {
-        keep_exposures();
+        app_exposures(app_live.exposure_cycles);
+        dirty = 1;
         looks = LOOKS_LATER;
     }
 }

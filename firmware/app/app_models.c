@@ -182,18 +182,23 @@ SELDOM int8_t app_model_verify(uint8_t slot, uint16_t seq)
 
 SELDOM int8_t app_trial_use(uint16_t seq)
 {
-    return begin(SG_MSG_TRIAL_USE, SG_SLOT_RAM, seq);
+    return TRIAL ? begin(SG_MSG_TRIAL_USE, SG_SLOT_RAM, seq) : (int8_t)SG_E_BOUNDS;
 }
 
 SELDOM int8_t app_trial_leave(struct sg_model_verdict *body)
 {
-    if (check.at && check.type == SG_MSG_TRIAL_USE)
+    if (TRIAL && check.at && check.type == SG_MSG_TRIAL_USE)
         return SG_E_BUSY;
-    use(stored);
+    if (TRIAL)
+        use(stored);
     memset(body, 0, sizeof *body);
+    const struct sg_model_view *model = app_model();
     body->slot = active;
-    body->crc = active == SG_SLOT_NONE ? 0 : view[active].crc;
-    body->verdict = active == SG_SLOT_NONE ? SG_E_STATE : SG_OK;
+    body->verdict = SG_E_STATE;
+    if (model) {
+        body->crc = model->crc;
+        body->verdict = SG_OK;
+    }
     return SG_OK;
 }
 

@@ -187,7 +187,7 @@ SELDOM __attribute__((noclone)) int8_t app_settings(struct sg_settings *io)
         app_rate_renew();
     }
     io->frame_period_us = app_frame_us();
-    io->rate_hz = million_over(io->frame_period_us);
+    io->rate_hz = app_live.rate_hz;
     io->rate_limit_hz = million_over(shortest(&io->period_us));
     io->period_us = us_of(app_timing()->period_cycles);
     io->repeats = app_live.repeats;

@@ -93,7 +93,7 @@ const uint8_t *hal_slot(uint8_t slot);
 // whole copy of exactly n bytes, or returns 0; records of different n do not disturb each other. hal_save
 // begins a write in the background and returns 1, or 0: ask again. `record` is borrowed until it is written;
 // after a change in it call hal_save again before the next hal_poll(), and the write begins afresh. What was
-// stored before stays whole meanwhile. n <= HAL_RECORD_MAX.
+// stored before stays whole meanwhile, and what equals it is not written again. n <= HAL_RECORD_MAX.
 uint8_t hal_load(void *record, uint8_t n);
 uint8_t hal_save(const void *record, uint8_t n);
 

@@ -91,7 +91,8 @@ enum sg_fault {
 };
 // Bits of sg_status.alarm.
 enum sg_alarm {
-    SG_ALARM_SUPPLY = 1,        // the supply left 4.5 .. 5.5 V, or moved by more than 4 % since boot
+    SG_ALARM_SUPPLY = 1,        // the supply is more than 4 % off the first value since boot, or cannot be
+                                // measured any more (outside of some 3.5 .. 6.3 V); looked at once a second
     SG_ALARM_LOCKOUT = 2,       // lights are held off: the watchdog had to reset, and it is not 1 s ago
     SG_ALARM_LIGHTS_OFF = 4,    // lights are off by command
 };
@@ -142,7 +143,7 @@ struct sg_status {
     uint8_t exposure_auto;      // 1 automatic, 0 held
     uint8_t active;             // enum sg_slot of the model in use
     uint16_t eeprom_writes;     // live-state records written since boot
-    uint16_t supply_mv;         // 0: not measured
+    uint16_t supply_mv;         // give or take 10 %; 0: not measured, or outside of what can be
     uint8_t fault[6];           // bits of enum sg_fault per channel
     uint8_t alarm;              // bits of enum sg_alarm
     uint8_t reserved;
@@ -227,8 +228,8 @@ struct sg_model_verdict {
 
 // A frame is `repeats` sensing cycles, whose photocurrents are averaged; a cycle takes period_us.
 struct sg_settings {
-    uint16_t rate_hz;           // frames a second: wanted, and in the reply as in force; 0: as fast as can be,
-                                // 1..15 are refused
+    uint16_t rate_hz;           // frames a second wanted, in the reply too, even one above the limit;
+                                // 0: as fast as can be, 1..15 are refused. In force is frame_period_us
     uint16_t rate_limit_hz;     // reply: the most that this model, these streams and these repeats allow
     uint16_t period_us;         // reply: one sensing cycle, device time
     uint16_t frame_period_us;   // reply: from frame to frame, device time

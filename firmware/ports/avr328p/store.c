@@ -2,7 +2,7 @@
 // Live state in EEPROM: two copies, each  payload | sequence | CRC-16. A write goes to the older copy, one
 // byte per 3.4 ms, started and left; if power fails in the middle its CRC does not fit and the other copy is
 // still whole. Records of another size lie elsewhere, so that those of an older firmware outlive the first
-// write of a newer one.
+// write of a newer one. What the newer copy holds already is not written again: sequence and CRC wear, too.
 #include "port.h"
 
 #include <avr/eeprom.h>
@@ -59,8 +59,26 @@ uint8_t hal_load(void *record, uint8_t n)
     return any;
 }
 
+// Nothing can be read while a byte is being written: then it is not known, and is written.
+static uint8_t stored(const uint8_t *record, uint8_t n)
+{
+    if (EECR & (1 << EEPE))
+        return 0;
+    uint16_t at = place(!copy, n);
+    do {
+        EEAR = at++;
+        EECR = 1 << EERE;
+        if (EEDR != *record++)
+            return 0;
+    } while (--n);
+    return 1;
+}
+
 uint8_t hal_save(const void *record, uint8_t n)
 {
+    left = 0;
+    if (stored(record, n))
+        return 1;
     tail.sequence = sequence + 1;
     tail.crc = record_crc(record, n);
     from = record;
