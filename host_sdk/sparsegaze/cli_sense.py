@@ -59,6 +59,7 @@ def settings_report(now):
     """A wire.Settings as plain values."""
     return {
         "rate_hz": now.frame_hz,
+        "rate_wished_hz": now.rate_hz or None,
         "rate_limit_hz": now.rate_limit_hz,
         "repeats": now.repeats,
         "cycles_a_frame": now.cycles_a_frame,
@@ -77,10 +78,11 @@ def settings_lines(now, vectors, limits):
     count = now.cycles_a_frame
     cycles = "1 cycle" if count == 1 else f"the mean of {count} cycles"
     dark = now.frame_period_us - count * now.period_us
+    wish = f"; {now.rate_hz} are wished for" if now.rate_hz > now.most_hz else ""
     pause = f", then {dark} us dark" if dark > count else ""
     return pairs(
         [
-            ("rate", f"{now.frame_hz:.1f} Hz of the gaze"),
+            ("rate", f"{now.frame_hz:.1f} Hz of the gaze{wish}"),
             (
                 "at most",
                 f"{max(limits['gaze'], int(now.frame_hz))} Hz with {with_model}; {limits['features']} Hz "
@@ -199,7 +201,7 @@ def change(device, port, wanted):
         for name in ("repeats", "rolling", "lights")
         if name in wanted and getattr(now, name) != wanted[name]
     ]
-    if rate > now.rate_hz + max(1, rate // 200) or differs:
+    if rate > now.frame_hz + max(1, rate // 200) or differs:
         limit, repeats = now.rate_limit_hz, now.repeats
         device.settings_back(before)
         if differs:
@@ -217,7 +219,8 @@ def change(device, port, wanted):
             f"{rate} Hz is too fast: with {model} and {cycles} a frame this device does at most {limit} Hz",
             remedy,
         )
-    wait_stored(device, written)
+    if now != before._replace(op=now.op):
+        wait_stored(device, written)
     return now, vectors
 
 

@@ -13,13 +13,14 @@ import numpy as np
 
 from . import wire
 from .clock import Clock
-from .errors import DeviceError, NoDeviceError, ProtocolError
+from .errors import DeviceError, NoDeviceError, ProtocolError, one_of
 from .exchange import Exchange, refusal
 from .sensing import Sensing
 from .stream import Assembler
 from .transport import open_link
 from .wire import Counts, Gaze, Hello, Mode, ModelInfo, Pong, Raw, Recentre, Status, Verdict, lib
 
+SLOTS = (lib.SG_SLOT_A, lib.SG_SLOT_B, lib.SG_SLOT_RAM)
 SPEEDS = (1_000_000, 500_000)
 BOOT_WAIT_S = 1.7               # the bootloader listens this long; what we said to it would only confuse it
 HELLO_EVERY_S = 0.25
@@ -191,7 +192,7 @@ class Device(Sensing):
         Raises DeviceError(SG_E_MAGIC) when there is no valid model in it.
         """
         info = self.model_info()
-        slot = info.active if slot is None else slot
+        slot = info.active if slot is None else one_of(SLOTS, slot, "a slot")
         if slot > lib.SG_SLOT_RAM or info.verdict[slot] != lib.SG_OK:
             raise refusal(lib.SG_E_MAGIC, lib.SG_MSG_MODEL_READ)
         head = self.read_slot(slot, lib.SG_MODEL_PAGE)
@@ -203,6 +204,7 @@ class Device(Sensing):
     def read_slot(self, slot, size, start=0):
         """`size` bytes from `start` on as they stand in `slot`, model or not."""
         image = bytearray()
+        one_of(SLOTS, slot, "a slot")
         while len(image) < size:
             step = min(lib.SG_WIRE_DATA_MAX, size - len(image))
             body = wire.body("struct sg_model_at", offset=start + len(image), slot=slot, length=step)
@@ -215,8 +217,8 @@ class Device(Sensing):
 
     def verify(self, slot):
         """Verdict on `slot` with the CRC-32 computed afresh by the device."""
-        return self._exchange.request(lib.SG_MSG_MODEL_VERIFY, wire.body("struct sg_model_at", slot=slot),
-                                      Verdict)
+        body = wire.body("struct sg_model_at", slot=one_of(SLOTS, slot, "a slot"))
+        return self._exchange.request(lib.SG_MSG_MODEL_VERIFY, body, Verdict)
 
     def trial(self, image):
         """Use a model from RAM until the next reset; None goes back to the stored one.

@@ -70,5 +70,12 @@ class VirtualError(SparsegazeError):
     """The virtual Nano cannot be built, started or controlled."""
 
 
+def one_of(names, value, what, error=ValueError):
+    """`value`, if it is one of the names. Raises `error`, one line that lists them, if it is not."""
+    if value not in tuple(names):
+        raise error(f"{what} is one of {', '.join(map(str, names))}, not {value!r}")
+    return value
+
+
 def _one_line(text):
     return " ".join(str(text).split())

@@ -63,12 +63,14 @@ def of(status, port="PORT"):
 
 
 def _supply(status):
+    remedy = "use another USB port or a shorter cable, without a hub"
     volts = status.supply_volts
-    measured = "the supply voltage" if volts is None else f"the supply voltage, {volts:.2f} V,"
-    return (
-        f"{measured} moved by more than 4 % since the board started",
-        "use another USB port or a shorter cable, without a hub",
-    )
+    if volts is None:
+        return (
+            "the supply voltage, measured before, is outside of 3.5 to 6.3 V now, or its wire to A7 is off",
+            f"check the divider at A7; {remedy}",
+        )
+    return f"the supply, {volts:.2f} V, is more than 4 % off what it was when the board started", remedy
 
 
 def refuse(device):

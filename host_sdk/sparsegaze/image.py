@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from .errors import SceneError
+from .errors import SceneError, one_of
 from .scene import Scene, simulator
 
 PARTS = {"face": 1, "sclera": 2, "iris": 4, "glint": 8}
@@ -166,7 +166,7 @@ class _EmbreeCamera:
     def render(self, azimuth_deg, elevation_deg, pupil_mm, lid_opening, parts=PARTS):
         """[emitter, row, column] radiance of the sum of the named parts."""
         out = np.empty(self._shape)
-        terms = sum(PARTS[name] for name in parts)
+        terms = sum(PARTS[one_of(PARTS, name, "a part", SceneError)] for name in parts)
         self._render((azimuth_deg, elevation_deg, pupil_mm, lid_opening), terms, out)
         return out
 

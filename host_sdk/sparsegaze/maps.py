@@ -19,7 +19,7 @@ from typing import Dict, List
 import numpy as np
 
 from . import __version__
-from .errors import SceneError
+from .errors import SceneError, one_of
 from .headset import Headset, lit_of, load_headset
 from .mapjudge import mean_response
 from .mapmake import Making
@@ -82,8 +82,9 @@ class GazeMap:
     not_modelled: str = NOT_MODELLED
 
     def sensor_maps(self, state=0, part=None):
-        """What each sensor collects with its emitters lit, [sensor, elevation, azimuth]."""
-        values = (self.parts[part] if part else self.response)[state]
+        """What each sensor collects with its emitters lit, [sensor, elevation, azimuth]; part: one of parts."""
+        whole = self.parts[one_of(self.parts, part, "a part", SceneError)] if part else self.response
+        values = whole[state]
         return np.where(self.lit[:, :, None, None], values, 0.0).sum(1)
 
     @property

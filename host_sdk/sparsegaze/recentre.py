@@ -20,7 +20,6 @@ LIMIT_S = 6.0  # in all, for eyes that blink
 LEAST_FRAMES = 60
 SPREAD_LIMIT_DEG = 2.0  # a gaze that wanders more was not resting on the point
 OFFSET_LIMIT_DEG = 30.0
-STORE_LIMIT_S = 1.5  # one record in EEPROM takes about 0.2 s
 NO_GAIN = ((0.0, 0.0), (0.0, 0.0))
 
 
@@ -133,7 +132,7 @@ def keep(device, offset_deg=None, gain=None):
     """
     written = device.status().eeprom_writes
     after = device.recentre(offset_deg, gain, clear=offset_deg is None)
-    wait_stored(device, written, STORE_LIMIT_S)
+    wait_stored(device, written)
     return after
 
 

@@ -5,7 +5,7 @@ from dataclasses import fields
 
 import numpy as np
 
-from .errors import SceneError
+from .errors import SceneError, one_of
 from .person import Person
 
 TERMS = {"face": 1, "sclera": 2, "iris": 4, "eye": 6, "smooth": 7}
@@ -117,7 +117,7 @@ class Scene:
             self._scene,
             azimuth_deg,
             elevation_deg,
-            TERMS[terms],
+            TERMS[one_of(TERMS, terms, "a term", SceneError)],
             self._ffi.from_buffer("double[]", pupils),
             len(pupils),
             self._ffi.from_buffer("double[]", lids),

@@ -140,13 +140,13 @@ class Counts(record("struct sg_counts", "Counts")):
 
 
 class Settings(record("struct sg_settings", "Settings")):
-    """How the device senses, as in force; struct sg_settings."""
+    """How the device senses; struct sg_settings. rate_hz is the rate wished for, 0: as fast as can be."""
 
     __slots__ = ()
 
     @property
     def frame_hz(self):
-        """Frames a second of device time."""
+        """Frames a second of device time, in force."""
         return 1e6 / self.frame_period_us if self.frame_period_us else 0.0
 
     @property

@@ -224,8 +224,8 @@ class FakeDevice:
             self._changed()
         limit = self.limit_hz // self.sensing["repeats"]
         rate = min(self.sensing["rate_hz"] or limit, limit)
-        return Settings(rate, limit, 999, round(1e6 / rate), 0, *(self.sensing[name] for name in (
-            "repeats", "wiring", "power", "rolling", "lights")))
+        rest = (self.sensing[name] for name in ("repeats", "wiring", "power", "rolling", "lights"))
+        return Settings(self.sensing["rate_hz"], limit, 999, round(1e6 / rate), 0, *rest)
 
     def exposure(self, us=None, auto=None, limit_us=None):
         if us is not None:

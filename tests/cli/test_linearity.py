@@ -45,7 +45,7 @@ class Paced(BentSensor):
 
     def settings(self, **wanted):
         now = super().settings(**wanted)
-        self.frame_us = round(1e6 / now.rate_hz)
+        self.frame_us = now.frame_period_us
         return now
 
 

@@ -147,6 +147,8 @@ FAULTS = [
     (dict(fault=(0, 0, lib.SG_FAULT_LOW, 0, 0, 0)), "low", "sensor 2 gets far less light", "probe PORT"),
     (dict(fault=(0, 0, 0, 0, 0, lib.SG_FAULT_HIGH)), "high", "something lies close before it", "finger"),
     (dict(alarm=lib.SG_ALARM_SUPPLY, supply_mv=4310), "supply", "4.31 V", "another USB port"),
+    (dict(alarm=lib.SG_ALARM_SUPPLY, supply_mv=4810), "supply", "4 % off what it was", "another USB port"),
+    (dict(alarm=lib.SG_ALARM_SUPPLY, supply_mv=0), "supply", "outside of 3.5 to 6.3 V now", "divider at A7"),
     (dict(alarm=lib.SG_ALARM_LOCKOUT), "lockout", "the watchdog had to restart", "wait a second"),
     (dict(alarm=lib.SG_ALARM_LIGHTS_OFF), "lights-off", "off by command", "--lights on"),
 ]
