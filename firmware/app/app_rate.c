@@ -5,6 +5,8 @@
 
 #include <string.h>
 
+// The host foretells rates from the same numbers (choose.py): cut out like the core's declarations.
+// cdef begin
 // Cycles of a 16 MHz AVR, measured (tests/budget.csv; tests/target/test_settings.py holds them to it).
 enum app_rate_cost {
     COST_SENSE = 4250,          // interrupts of one sensing cycle; they send the gaze as well
@@ -20,7 +22,7 @@ enum app_rate_cost {
 
 // All of the following is in device microseconds, of 16 cycles, rounded so that nothing gets too short. A frame
 // lasts 62500 us at most: 16 bits hold everything.
-enum {
+enum app_rate_us {
     CYCLES_PER_US = SG_EXPOSE_CYCLES_PER_US,
     PERIOD_LEAST_US = 999,      // 18 conversions as close as the converter can, 888 cycles,
     PERIOD_MOST_US = 1998,      // and as far apart as the port's timer reaches
@@ -29,6 +31,7 @@ enum {
     BYTE_US = 10,               // on the line at 1 Mbaud
     PACKET_BYTES = SG_WIRE_FRAME_MAX - SG_WIRE_BODY_MAX,
 };
+// cdef end
 
 // Whole microseconds of so many cycles. One place, because a shift is a loop.
 SELDOM static uint16_t us_of(uint16_t cycles)

@@ -25,6 +25,7 @@ SOURCES = ("sg_wire.c", "sg_model.c", "sg_gp.c", "sg_gp_loop.c", "sg_gp_table.c"
            "sg_light_table.c", "sg_expose.c", "sg_health.c",
            "sg_link.c", "sg_track.c")
 BATCH = "_core_batch.c"
+RATE = os.path.normpath(os.path.join(CORE, "..", "app", "app_rate.c"))    # its enums: what a frame costs
 REGION = re.compile(r"^// cdef begin\n(.*?)^// cdef end$", re.MULTILINE | re.DOTALL)
 
 
@@ -48,11 +49,12 @@ def make_ffi(core=CORE, root=None):
     ffi = FFI()
     batch = os.path.join(HERE, BATCH)
     declared = []
-    for path in [os.path.join(core, header) for header in HEADERS] + [batch]:
+    for path in [os.path.join(core, header) for header in HEADERS] + [batch, RATE]:
         declared.extend(cdef_regions(path))
     ffi.cdef("\n".join(declared))
-    # The batch file has no header: its prototypes come from its own marked region.
-    prelude = "".join(f'#include "{header}"\n' for header in HEADERS) + "".join(cdef_regions(batch))
+    # These two files have no header: what they declare comes from their own marked regions.
+    prelude = "".join(f'#include "{header}"\n' for header in HEADERS)
+    prelude += "".join(cdef_regions(batch) + cdef_regions(RATE))
     ffi.set_source(
         "sparsegaze._core", prelude,
         sources=[place(os.path.join(core, source)) for source in SOURCES] + [place(batch)],

@@ -72,6 +72,7 @@ def run(
     csv=None,
     truth=True,
     progress=None,
+    rate_hz=None,
 ):
     """Calibrate the device behind `port` and return a Calibration.
 
@@ -84,15 +85,17 @@ def run(
     screen        see screen.py; None chooses (window: dict of arguments of WindowScreen)
     csv           path for the stream of the validation; truth: see validate.run
     progress      called as progress(stage, done, total)
+    rate_hz       that the Nano is to reach with the gaze streamed: as many vectors as leave it the time
     The recording is on disk from the first target on, and stays when anything after it fails.
     Raises PortError, NoDeviceError, CalibrationError, RecordingError, FlashError.
     """
-    from . import store
+    from . import choose, store
     from .device import Device
     from .distil import fit_recording
     from .screen import screen_for
     from .transport import open_link
 
+    choose.most_vectors(None, vectors, rate_hz)  # refused before anybody has looked at a target
     with open_link(port) as link:
         device = Device(link)
         _make(folder)
@@ -109,7 +112,9 @@ def run(
             try:
                 capture.check(taken)
                 seen = _who_sees_whom(device, shown)
-                fitted = fit_recording(taken.recording, n_vectors=vectors, progress=progress)
+                fitted = fit_recording(
+                    taken.recording, n_vectors=vectors, progress=progress, rate_hz=rate_hz
+                )
                 if folder:
                     fitted.model.save(os.path.join(folder, MODEL))
                 done = Calibration(taken, fitted, None, None, folder, seen)

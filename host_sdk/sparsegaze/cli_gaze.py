@@ -12,7 +12,12 @@ from .cli_device import Number, json_option, port_argument
 from .console import Console, pairs, table
 
 VECTORS = click.IntRange(1, 91)  # choose.ROOM
+RATE = click.IntRange(16, 65535)  # SG_WIRE_RATE_LEAST_HZ
 VECTORS_HELP = "Calibration vectors of the device's model.  [default: the fewest that do]"
+RATE_HELP = (
+    "Gazes a second that the Nano is to reach: the most vectors that leave it the time, with the gaze alone "
+    "on the line and one cycle a frame. A recentring costs 4 %; streaming features costs more."
+)
 KERNELS = ("rbf", "matern52", "laplace", "minkowski", "canberra", "cosine")
 
 
@@ -103,6 +108,7 @@ def _accuracy_lines(report):
     type=VECTORS,
     help=VECTORS_HELP,
 )
+@click.option("--rate", "rate_hz", type=RATE, metavar="HZ", help=RATE_HELP)
 @click.option(
     "--validation",
     "n_validation",
@@ -121,7 +127,9 @@ def _accuracy_lines(report):
 )
 @screen_options
 @json_option
-def calibrate(port, n_targets, vectors, n_validation, seed, save, distance_mm, width_mm, windowed, as_json):
+def calibrate(
+    port, n_targets, vectors, rate_hz, n_validation, seed, save, distance_mm, width_mm, windowed, as_json
+):
     """Show targets, record, fit, upload the model and validate it: the whole calibration of a device.
 
     Look at each dot until it moves; blink while it moves. A simulated person does so by itself. Targets cover
@@ -147,6 +155,7 @@ def calibrate(port, n_targets, vectors, n_validation, seed, save, distance_mm, w
                 folder,
                 window=window_of(distance_mm, width_mm, windowed),
                 progress=progress,
+                rate_hz=rate_hz,
             )
     except BaseException as error:
         kept = os.path.join(folder, module.RECORDING)
@@ -245,8 +254,9 @@ def record(port, output, n_targets, seed, distance_mm, width_mm, windowed, as_js
     type=click.IntRange(min=1),
     help="Most cycles an inference may take on the Nano: as many vectors as fit, unless fewer do as well.",
 )
+@click.option("--rate", "rate_hz", type=RATE, metavar="HZ", help=RATE_HELP)
 @json_option
-def fit(file, output, vectors, kernel, p, budget_cycles, as_json):
+def fit(file, output, vectors, kernel, p, budget_cycles, rate_hz, as_json):
     """Make a model from a recording: a Gaussian process in float64, distilled to a few fixed-point vectors.
 
     Any CSV with the columns t_us, s0.., target_az_deg, target_el_deg, valid can be fitted, whoever made it.
@@ -254,6 +264,7 @@ def fit(file, output, vectors, kernel, p, budget_cycles, as_json):
     \b
     Example:
         sparsegaze fit eye.csv -o eye.sgm
+        sparsegaze fit eye.csv --rate 1000
         sparsegaze fit eye.csv --budget-cycles 7000 --json
     """
     from .distil import fit_recording
@@ -265,7 +276,13 @@ def fit(file, output, vectors, kernel, p, budget_cycles, as_json):
     with console.progress() as progress, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         fitted = fit_recording(
-            recording, vectors, kernel=kernel, p=p, budget_cycles=budget_cycles, progress=progress
+            recording,
+            vectors,
+            kernel=kernel,
+            p=p,
+            budget_cycles=budget_cycles,
+            progress=progress,
+            rate_hz=rate_hz,
         )
     doubts = [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
     if recording.outdated:

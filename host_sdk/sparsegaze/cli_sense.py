@@ -214,7 +214,10 @@ def change(device, port, wanted):
         if repeats > 1:
             remedy += ", or fewer --repeats"
         elif vectors:
-            remedy += ", or calibrate with fewer --vectors"
+            from .choose import vectors_at
+
+            fewer = vectors_at(rate)
+            remedy += f", or fit a model with --rate {rate}: {fewer} vectors" if 0 < fewer < vectors else ""
         raise SparsegazeError(
             f"{rate} Hz is too fast: with {model} and {cycles} a frame this device does at most {limit} Hz",
             remedy,

@@ -341,7 +341,9 @@ class FitReport:
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # the matrices are small: threads cost 20 times their gain
-def fit_recording(recording, n_vectors=None, seed=0, kernel="rbf", p=None, budget_cycles=None, progress=None):
+def fit_recording(
+    recording, n_vectors=None, seed=0, kernel="rbf", p=None, budget_cycles=None, progress=None, rate_hz=None
+):
     """Recording -> FitResult. Raises RecordingError, CalibrationError or ModelError; warns of channels it
     drops
     and of a recording that hardly depends on its targets.
@@ -349,13 +351,14 @@ def fit_recording(recording, n_vectors=None, seed=0, kernel="rbf", p=None, budge
     n_vectors      None chooses: choose.py
     kernel, p      of the full process, see kernels.kernel;  budget_cycles  most that an inference may take
     progress       called as progress(stage, done, total)
+    rate_hz        that the Nano is to reach with the gaze streamed: as many vectors as leave it the time
     """
     say = (lambda part: progress("fit", round(100 * part), 100)) if progress else (lambda part: None)
     say(0.0)
-    most = choose.most_vectors(budget_cycles, n_vectors)
+    most = choose.most_vectors(budget_cycles, n_vectors, rate_hz)
     process = fit_process(recording, seed, kernel, p)
     say(0.2)
-    aim_deg = None if n_vectors else choose.aim_deg(process.loo_rms_deg, budget_cycles)
+    aim_deg = None if n_vectors else choose.aim_deg(process.loo_rms_deg, budget_cycles, rate_hz)
     fixed, learnt = process.fixed, process.learnt
     rows = fixed.frames(CLOUD_EACH)
     features = fixed.features[rows]

@@ -70,7 +70,7 @@ def _supply(status):
             "the supply voltage, measured before, is outside of 3.5 to 6.3 V now, or its wire to A7 is off",
             f"check the divider at A7; {remedy}",
         )
-    return f"the supply, {volts:.2f} V, is more than 4 % off what it was when the board started", remedy
+    return f"the supply voltage, {volts:.2f} V, is more than 4 % off what it was at the start", remedy
 
 
 def refuse(device):

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `sparsegaze fit` says of a model: as one dict for programs, as lines for people."""
 
+import math
+
+from . import choose
 from .calibrate import plain
 
 
@@ -32,6 +35,8 @@ def summary(fitted):
             max_to_gp_deg=report["max_to_gp_deg"],
             held_out_rows=report["held_out_rows"],
             cycles=report["cycles"],
+            rates_hz=choose.rates_hz(model.vectors),
+            predicted_rms_deg=math.hypot(report["loo_rms_deg"], report["rms_to_gp_deg"]),
         )
     return plain({**out, "report": report})
 
@@ -41,6 +46,7 @@ def lines(summary):
     if "kernel" not in summary:
         return [("vectors", f"{summary['n_vectors']}, crc 0x{summary['crc']:08X}")]
     report, left_out, formats = summary["report"], summary["leave_one_out"], summary["formats"]
+    rates = summary["rates_hz"]
     rows = "frames it has not seen" if summary["held_out_rows"] else "likely inputs"
     items = [
         (
@@ -66,6 +72,12 @@ def lines(summary):
             "its distance",
             f"rms {summary['rms_to_gp_deg']:.3f}, at most {summary['max_to_gp_deg']:.2f} deg "
             f"from the full process, on {rows}",
+        ),
+        (
+            "foreseen",
+            f"rms {summary['predicted_rms_deg']:.2f} deg from targets it was not told, at up to "
+            f"{rates['gaze']} Hz; {rates['recentred']} after a recentring, {rates['features']} with the "
+            "features streamed too",
         ),
         (
             "its arithmetic",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from conftest import collect, costly_model, exchange, random_model
-from sparsegaze import wire
+from sparsegaze import choose, wire
 from sparsegaze.errors import DeviceError
 from sparsegaze.wire import lib
 
@@ -176,6 +176,17 @@ def test_the_limit_follows_the_streams_and_the_line_and_the_wish_is_kept(board):
     assert device.status().tx_dropped - before <= 3         # the requests take the line, too
 
 
+@pytest.mark.parametrize("vectors", [1, 15, 16, 24, 64, 91])
+def test_the_rates_that_the_host_foretells_are_the_device_s_own(board, vectors):
+    _, device = board(models={0: random_model(vectors).image})
+    streams = [{}, {"features": True}, {"features": True, "counts": True}]
+    for recentred, repeats, more in itertools.product((False, True), (1, 4), streams):
+        device.recentre((1.0, 0.0)) if recentred else device.recentre(clear=True)
+        device.set_stream(gaze=True, raw="features" in more, counts="counts" in more)
+        limit = device.settings(rate_hz=0, repeats=repeats).rate_limit_hz
+        assert choose.rate_limit_hz(vectors, recentred=recentred, repeats=repeats, **more) == limit
+
+
 @pytest.mark.parametrize("vectors", [0, 1, 20, 64])
 def test_no_frame_is_late_with_any_model_streams_and_repeats(board, vectors):
     """The estimate of the work of a frame is above what it takes, and not far above."""
@@ -266,7 +277,8 @@ def test_a_probe_lights_one_emitter_alone_and_all_is_as_before_afterwards(board)
 def test_probes_are_refused_in_the_dark_and_one_at_a_time(board):
     _, device = board()
     asked = wire.encode(lib.SG_MSG_PROBE, 1, b"\1") + wire.encode(lib.SG_MSG_PROBE, 2, b"\2")
-    answers = sorted((packet.seq, packet.type) for packet in exchange(device, asked))
+    packets = exchange(device, asked)
+    answers = sorted((packet.seq, packet.type) for packet in packets)
     assert answers == [(1, lib.SG_MSG_PROBE | lib.SG_REPLY), (2, lib.SG_MSG_ERROR)]
     assert wire.parse_error(packets[0].body) == (lib.SG_E_BUSY, lib.SG_MSG_PROBE)
     device.settings(lights=False)
@@ -288,7 +300,7 @@ def test_trying_many_exposures_does_not_wear_the_store(board):
 
 
 def test_a_host_that_says_the_same_for_ever_does_not_wear_the_store(board):
-    """Nothing is written of what is stored already, not even the sequence number; the answers stay the same."""
+    """What is stored already is not written, not even the sequence number; the answers stay the same."""
     nano, device = board(models={0: random_model(15).image})
     said = {
         "settings": lambda: device.settings(rate_hz=250, repeats=2),

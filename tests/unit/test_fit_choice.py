@@ -54,11 +54,41 @@ def test_a_budget_that_is_too_small_states_the_least():
     assert str(choose.cycles(30)) in caught.value.remedy and "30 vectors" in caught.value.message
 
 
+def test_a_rate_takes_the_most_vectors_that_reach_it_and_one_more_would_not():
+    for rate in (560, 700, 900, 1000, 1001):
+        n = choose.vectors_at(rate)
+        assert 1 <= n < choose.ROOM and choose.rate_limit_hz(n) >= rate > choose.rate_limit_hz(n + 1)
+    assert choose.vectors_at(1000) == choose.most_vectors(rate_hz=1000) == 15
+    assert choose.vectors_at(16) == choose.ROOM and choose.most_vectors(rate_hz=16) == choose.MOST
+    assert choose.most_vectors(rate_hz=700, n_vectors=7) == 7
+    cost = choose.cycles(9)
+    assert choose.most_vectors(cost, rate_hz=700) == 9 and choose.most_vectors(10 * cost, rate_hz=1000) == 15
+    for slower in ({"features": True}, {"recentred": True}, {"repeats": 2}):
+        assert choose.rate_limit_hz(15, **slower) < choose.rate_limit_hz(15)
+    with_features = choose.rate_limit_hz(15, features=True)
+    assert choose.rate_limit_hz(15, features=True, counts=True) < with_features
+
+
+@pytest.mark.parametrize(
+    "wish, words",
+    [
+        ({"rate_hz": 2000}, "2000 Hz is too fast: the device does 1001 Hz at most: "
+                            "ask for --rate 1001 at most, which it reaches with up to 15 vectors"),
+        ({"rate_hz": 1000, "n_vectors": 24}, "1000 Hz is too fast: 24 vectors do 916 Hz at most: "
+                                             "ask for --rate 916 at most, or --vectors 15"),
+    ],
+)  # fmt: skip
+def test_a_rate_out_of_reach_names_the_highest_there_is(wish, words):
+    with pytest.raises(ModelError) as caught:
+        choose.most_vectors(**wish)
+    assert str(caught.value) == words
+
+
 def test_the_aim_is_what_five_percent_of_the_error_allow_and_never_above_the_ceiling():
     assert choose.aim_deg(10.0) == choose.AIM_DEG
     error = 0.1
     assert np.hypot(error, choose.aim_deg(error)) == pytest.approx(1.05 * error)
-    assert choose.aim_deg(0.3, budget_cycles=9000) == choose.FINE_DEG
+    assert choose.aim_deg(0.3, budget_cycles=9000) == choose.aim_deg(0.3, rate_hz=900) == choose.FINE_DEG
 
 
 def test_the_fewest_vectors_that_meet_the_aim_are_found(eye):
@@ -128,6 +158,18 @@ def test_fit_within_a_budget_and_with_another_kernel(run, tmp_path):
     assert data["n_vectors"] == 9 and data["cycles"] <= budget and data["kernel"]["kernel"] == "matern52"
 
 
+def test_fit_for_a_rate_takes_the_vectors_that_reach_it_and_says_what_to_expect(run, tmp_path):
+    _, out, _ = run("-o", tmp_path / "eye.sgm", "--rate", 1000, "--json")
+    data = json.loads(out)
+    assert data["n_vectors"] == 15 and data["rates_hz"]["gaze"] >= 1000 > data["rates_hz"]["recentred"]
+    rms = data["leave_one_out"]["rms_deg"]
+    assert data["predicted_rms_deg"] == pytest.approx(np.hypot(rms, data["rms_to_gp_deg"])) and rms > 0
+    said = run("-o", tmp_path / "eye.sgm", "--rate", 1000)[1]
+    line = next(line for line in said.splitlines() if line.startswith("foreseen"))
+    assert f"rms {data['predicted_rms_deg']:.2f} deg" in line
+    assert "up to 1001 Hz; 964 after a recentring" in line
+
+
 def test_fit_for_people_names_what_matters(run, tmp_path):
     said = run("-o", tmp_path / "eye.sgm", "--vectors", 8)[1]
     for word in ("49 targets", "8 vectors", "cycles on the Nano", "rms", "proven", "condition"):
@@ -143,6 +185,8 @@ def test_fit_with_a_measure_that_is_no_covariance_says_so_to_people(run, tmp_pat
     "args, named",
     [
         (["--budget-cycles", 100], f"--budget-cycles {choose.cycles(1)}"),
+        (["--rate", 1002], "1002 Hz is too fast: the device does 1001 Hz at most"),
+        (["--rate", 1000, "--vectors", 24], "or --vectors 15"),
         (["--kernel", "minkowski"], "give p"),
         (["--kernel", "rbf", "--p", 2], "no order p"),
     ],
@@ -156,3 +200,10 @@ def test_what_cannot_be_is_refused_in_one_line(run, tmp_path, args, named):
 def test_fit_help_has_an_example(run):
     code, said, _ = run("--help")
     assert code == 0 and "Example:" in said and "sparsegaze fit eye.csv" in said and "--budget-cycles" in said
+    assert "--rate HZ" in said and "Gazes a second" in said and "fit eye.csv --rate 1000" in said
+
+
+@pytest.mark.parametrize("rate", ["0", "15", "fast", "65536"])
+def test_a_rate_that_is_none_is_refused_by_the_range(run, tmp_path, rate):
+    code, out, err = run("-o", tmp_path / "eye.sgm", "--rate", rate)
+    assert code == 2 and out == "" and "--rate" in err and len(err.splitlines()) == 1
