@@ -19,8 +19,8 @@ import numpy as np
 from demo_picture import draw
 from sparsegaze import calibrate, flash, metrics, session, store, targets, validate
 from sparsegaze.device import Device
-from sparsegaze.distil import fit_recording
 from sparsegaze.errors import SparsegazeError
+from sparsegaze.fit import fit_recording
 from sparsegaze.headset import load_headset
 from sparsegaze.mapplot import save_maps
 from sparsegaze.person import draw_person

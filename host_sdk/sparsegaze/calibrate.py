@@ -15,7 +15,7 @@ LOOK_S = 0.5  # to look back at the centre
 
 @dataclass
 class Calibration:
-    """capture (capture.Capture), fit (distil.FitResult), upload (store.UploadReport or None), validation (or
+    """capture (capture.Capture), fit (fit.FitResult), upload (store.UploadReport or None), validation (or
     None), folder (where recording, model and report are kept, or None), seen (who saw whom, float64 [6, 6] of
     probe.measure, or None).
     """
@@ -91,7 +91,7 @@ def run(
     """
     from . import choose, store
     from .device import Device
-    from .distil import fit_recording
+    from .fit import fit_recording
     from .screen import screen_for
     from .transport import open_link
 

@@ -267,7 +267,7 @@ def fit(file, output, vectors, kernel, p, budget_cycles, rate_hz, as_json):
         sparsegaze fit eye.csv --rate 1000
         sparsegaze fit eye.csv --budget-cycles 7000 --json
     """
-    from .distil import fit_recording
+    from .fit import fit_recording
     from .fitreport import lines, summary
     from .recording import Recording
 

@@ -49,7 +49,7 @@ def fake(monkeypatch):
         device = FakeDevice(model, **options)
         monkeypatch.setattr("sparsegaze.device.Device", lambda port, *_: device)
         monkeypatch.setattr("sparsegaze.screen.screen_for", lambda *_, **__: device.screen)
-        monkeypatch.setattr("sparsegaze.distil.fit_recording", fit_linear)
+        monkeypatch.setattr("sparsegaze.fit.fit_recording", fit_linear)
         monkeypatch.setattr(
             "sparsegaze.transport.open_link", lambda port, *_: contextlib.nullcontext(device.link)
         )

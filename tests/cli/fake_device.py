@@ -45,7 +45,7 @@ def linear_model(generation=1, inverse=None, n_vectors=64):
 
 
 def fit_linear(recording, n_vectors=None, **options):
-    """What distil.fit_recording does, for linear optics, at once."""
+    """What fit.fit_recording does, for linear optics, at once."""
     x = recording.features[recording.valid].astype(float) - MIDDLE
     inverse = np.linalg.lstsq(x, recording.target_deg[recording.valid], rcond=1e-3)[0].T
     miss = x @ inverse.T - recording.target_deg[recording.valid]

@@ -9,8 +9,9 @@ import pytest
 from sparsegaze import distil as module
 from sparsegaze import fixations as fixations_module
 from sparsegaze import choose, process, rounding
-from sparsegaze.distil import distil, fit_recording
+from sparsegaze.distil import distil
 from sparsegaze.errors import CalibrationError, ModelError, RecordingError
+from sparsegaze.fit import fit_recording
 from sparsegaze.fixations import TARGETS_NEEDED, fixations
 from sparsegaze.gp import GaussianProcess
 from sparsegaze.metrics import frame_errors_deg

@@ -11,8 +11,9 @@ from test_distil import Eye
 from sparsegaze import choose, cli
 from sparsegaze import distil as module
 from sparsegaze.cli_gaze import VECTORS
-from sparsegaze.distil import distil, fit_recording
+from sparsegaze.distil import distil
 from sparsegaze.errors import ModelError
+from sparsegaze.fit import fit_recording
 from sparsegaze.gp import GaussianProcess
 from sparsegaze.model import DeviceModel
 

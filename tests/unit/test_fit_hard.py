@@ -9,8 +9,9 @@ from test_distil import Eye, errors
 from threadpoolctl import threadpool_limits
 
 from sparsegaze import distil as module
-from sparsegaze.distil import distil, fit_recording
+from sparsegaze.distil import distil
 from sparsegaze.expansion import Expansion
+from sparsegaze.fit import fit_recording
 from sparsegaze.gp import GaussianProcess
 from sparsegaze.metrics import frame_errors_deg
 from sparsegaze.process import fit_process, local_noise

@@ -15,7 +15,7 @@ import numpy as np
 
 from sparsegaze import calibrate, linearity, metrics, store, targets
 from sparsegaze.device import Device
-from sparsegaze.distil import fit_recording
+from sparsegaze.fit import fit_recording
 from sparsegaze.screen import VirtualScreen
 from sparsegaze.virtual import VirtualNano, locate_vheadset
 from sparsegaze.wire import lib
@@ -28,6 +28,7 @@ SOURCES = (
     "capture",
     "session",
     "selection",
+    "fit",
     "distil",
     "gp",
     "choose",

@@ -23,8 +23,8 @@ COSTS = ("cycles_min", "cycles_max", "flash", "ram", "bytes", "identical")
 
 
 def fit(recording, n_vectors):
-    """The one place where the product's fit is called: a distil.FitResult."""
-    from sparsegaze.distil import fit_recording
+    """The one place where the product's fit is called: a fit.FitResult."""
+    from sparsegaze.fit import fit_recording
 
     return fit_recording(recording, n_vectors=n_vectors)
 
@@ -88,7 +88,7 @@ def fitted(folder, data, n_vectors):
             "seconds": seconds,
         }
 
-    key = inference_data.file_hash([*sources_of("distil"), Path(__file__)], *words)
+    key = inference_data.file_hash([*sources_of("fit"), Path(__file__)], *words)
     return kept(Path(folder) / f"fit-{n_vectors}.pickle", key, make)
 
 
@@ -133,7 +133,7 @@ def row(folder, n_vectors):
 def plain_process(folder, data):
     """What a process plainly fitted to single frames gives: float64 [n, 2], every held-out row.
 
-    The reference beside the product's own (which learns from means of fixations, see distil.fit_recording):
+    The reference beside the product's own (which learns from means of fixations, see fit.fit_recording):
     hyper-parameters by the likelihood of 400 of the frames.
     """
     from sparsegaze.gp import GaussianProcess
