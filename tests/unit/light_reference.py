@@ -156,3 +156,8 @@ class Light:
         """Features [frames, 6] and flags [frames]."""
         rows = [self.frame(*(board.cycle(**kwargs) for _ in range(repeats))) for _ in range(frames)]
         return np.array([f for f, _ in rows]), np.array([g for _, g in rows])
+
+
+def settle(board, light, cycles=60):
+    """Run past the first averages."""
+    light.run(board, cycles)
