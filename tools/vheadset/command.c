@@ -292,14 +292,16 @@ static void do_counters(struct call *c)
         " tx_garbage=%" PRIu64 " rx_bytes=%" PRIu64 " tx_bytes=%" PRIu64 " spm_denied=%" PRIu64
         " page_writes=%" PRIu64 " eeprom_writes=%" PRIu64 " wdt_resets=%" PRIu64 " resets=%" PRIu64
         " power_ons=%" PRIu64 " session=%" PRIu64 " crashes=%" PRIu64 " host_dropped=%" PRIu64
-        " device_dropped=%" PRIu64 " clients=%d conversions=%" PRIu64 " asleep_cycles=%" PRIu64 " lit_cycles_0=%" PRIu64 " lit_cycles_1=%" PRIu64
+        " device_dropped=%" PRIu64 " clients=%d conversions=%" PRIu64 " asleep_cycles=%" PRIu64
+        " lit_cycles_0=%" PRIu64 " lit_cycles_1=%" PRIu64
         " lit_cycles_2=%" PRIu64 " lit_cycles_3=%" PRIu64 " lit_cycles_4=%" PRIu64 " lit_cycles_5=%" PRIu64
         " most_lit=%u longest_pulse_cycles=%" PRIu64 " led_charge_nc=%.0f",
         n->uart.overruns, n->uart.longest_rx, n->uart.rx_garbage, n->uart.tx_garbage,
         n->uart.rx_bytes, n->uart.tx_bytes, n->selfprog.denied, n->selfprog.page_writes, n->eeprom.writes,
         n->watchdog_resets, n->resets, n->power_ons, n->session, n->crashes, b->host_dropped,
-        b->device_dropped, b->clients, n->adc.conversions, n->asleep_cycles, l->lit_cycles[0], l->lit_cycles[1], l->lit_cycles[2],
-        l->lit_cycles[3], l->lit_cycles[4], l->lit_cycles[5], l->most_lit, l->longest_pulse, l->charge_nc);
+        b->device_dropped, b->clients, n->adc.conversions, n->asleep_cycles,
+        l->lit_cycles[0], l->lit_cycles[1], l->lit_cycles[2], l->lit_cycles[3],
+        l->lit_cycles[4], l->lit_cycles[5], l->most_lit, l->longest_pulse, l->charge_nc);
 }
 
 // For bench tests: a node's voltage now, how it is driven, when that began or a sample was taken, and what
