@@ -66,6 +66,7 @@ def test_the_source_distribution_carries_the_core_and_the_hex(sdist):
         "LICENSE",
         "firmware/core/sg_wire.h",
         "firmware/core/sg_wire.c",
+        "firmware/app/app_rate.c",
         "host_sdk/sparsegaze/_core_build.py",
         "host_sdk/sparsegaze/data/firmware.hex",
     } <= names
