@@ -27,6 +27,7 @@ enum app_rate_us {
     PERIOD_LEAST_US = 999,      // 18 conversions as close as the converter can, 888 cycles,
     PERIOD_MOST_US = 1998,      // and as far apart as the port's timer reaches
     PAUSE_US = 4,               // dark for longer than this is a pause; shorter is not worth shorter exposures
+    PAUSE_LEAST_US = 167,       // the port makes none shorter (3 slots), but by slots shorter than a conversion
     ROOMY_US = 500,             // the costliest request
     BYTE_US = 10,               // on the line at 1 Mbaud
     PACKET_BYTES = SG_WIRE_FRAME_MAX - SG_WIRE_BODY_MAX,
@@ -128,6 +129,8 @@ SELDOM void app_rate_start(struct hal_timing *timing)
     if (app_live.power == SG_POWER_NORMAL) {
         for (; repeats < SG_LIGHT_REPEATS_MAX && sensing + period <= frame; sensing += period)
             repeats++;
+    }
+    if (app_live.power == SG_POWER_NORMAL || (uint16_t)(frame - sensing) < PAUSE_LEAST_US) {
         for (; period < PERIOD_MOST_US && sensing + repeats <= frame; sensing += repeats)
             period++;
     }

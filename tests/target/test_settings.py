@@ -122,6 +122,29 @@ def test_flicker_is_rejected_at_any_rate(board, rate_hz):
     assert (spread[0.5] < spread[0.0] + 60).all()
 
 
+LOW = [(0, 1), (0, 2), (0, 16), (990, 1), (900, 1), (860, 1), (850, 1), (450, 2)]
+
+
+@pytest.mark.parametrize("rate_hz, repeats", LOW)
+def test_what_low_power_says_of_its_rate_is_what_it_does(board, rate_hz, repeats):
+    """No pause shorter than the port makes one: longer cycles instead, none shorter than its conversions.
+
+    Slots are whole cycles: up to 20 us a frame less than the estimate, which the answer tells.
+    """
+    _, device = board(models={0: random_model(16).image})
+    device.set_stream(gaze=True)
+    now = device.settings(power="low", rate_hz=rate_hz, repeats=repeats)
+    estimate_us = 1007 + 999 * (repeats - 1)
+    assert now.rate_limit_hz == 1_000_000 // estimate_us and now.most_hz >= int(now.frame_hz)
+    wanted_us = max(estimate_us, 1e6 / rate_hz if rate_hz else 0)
+    assert now.period_us >= 999 and wanted_us - 20 <= now.frame_period_us <= wanted_us + 1
+    settled(device, 20)
+    late = device.status().late_frames
+    assert hertz_of(settled(device, 200)) == pytest.approx(now.frame_hz, rel=1e-3)
+    if repeats == 1:
+        assert device.status().late_frames - late <= 20         # of some 500, by the requests
+
+
 def test_low_power_sleeps_and_is_dark_between_frames(board):
     nano, device = board()
     device.exposure(us=[100] * 6)
