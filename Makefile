@@ -98,6 +98,7 @@ check: firmware ## the quick static checks: includes, licences, packaging, link
 size: firmware ## flash and SRAM that the firmware takes, by section and by largest symbol
 	@$(BINUTILS)/avr-size -A -d build/firmware/firmware.elf
 	@$(BINUTILS)/avr-nm -S --size-sort -r -t d build/firmware/firmware.elf | head -n 20
+	@$(PY) tools/bench/frontend_size.py
 
 lock: ## write requirements.txt and requirements-bench.txt anew from their .in, with hashes
 	@python3 -m venv build/lock && build/lock/bin/pip install -qq uv

@@ -199,7 +199,7 @@ def good_report():
         "flicker_ratio_250": 1.1,
         "irradiance_w_m2": {"normal": 20.0},
         "margin": 1.2,
-        "flash": {"spare": 0.12},
+        "flash": {"spare": 0.12, "spare_old_loader": 0.12},
         "stack_free": 210,
         "valid_nominal": 0.99,
         "valid_flicker_250": 0.9,
@@ -263,7 +263,18 @@ def test_a_missed_bar_is_named_and_the_exit_code_is_one(bench, tmp_path, capsys)
     report = {**good_report(), "rate_hz": 900.0, "seconds": 60.0, "stream_seconds": 60.0}
     report["bars"] = bench.judge.bars(report)
     assert bench.judge.tell(report, tmp_path) == 1
-    assert "bar missed: * rate_hz" in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert "bar missed: * rate_hz" in said.err
+    assert "MISSED: a bar, a figure that is demanded" in said.out and "short:  an aim" in said.out
+
+
+def test_the_older_loader_s_share_is_an_aim_that_can_be_short(bench):
+    report = {**good_report(), "flash": {"spare": 0.12, "spare_old_loader": 0.06}}
+    missed = [bar for bar in bench.judge.bars(report) if not bar["met"]]
+    assert [bar["name"] for bar in missed if "loader" in bar["name"]] == [
+        "flash to spare, share, beside the older loader's 2 KiB"
+    ]
+    assert all(bar["kind"] == "aim" for bar in missed)
 
 
 def test_the_bound_is_that_of_independent_readings(bench, monkeypatch):
@@ -291,4 +302,7 @@ def test_size_counts_what_is_flashed(bench, firmware_elf):
     found = bench.size.size(firmware_elf)
     assert found["flash"]["bytes"] == pytest.approx(flashed, abs=2)
     assert found["flash"]["spare"] == pytest.approx(1 - (flashed + 3072 + 512) / 32768, abs=1e-3)
+    assert found["flash"]["spare_old_loader"] == pytest.approx(1 - (flashed + 3072 + 2048) / 32768, abs=1e-3)
+    line = bench.size.words(found)
+    assert "beside Optiboot (512 B)" in line and "beside the older bootloader (2048 B)" in line
     assert 0 < found["ram"]["bytes"] < 2048

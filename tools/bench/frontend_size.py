@@ -11,6 +11,7 @@ ELF = ROOT / "build" / "firmware" / "firmware.elf"
 HEADSET = ROOT / "headsets" / "led2gaze.toml"
 FLASH_BYTES, RAM_BYTES = 32768, 2048
 SLOTS_BYTES, BOOTLOADER_BYTES = 2 * 1536, 512  # two models, Optiboot: taken as well
+OLD_BOOTLOADER_BYTES = 2048  # of boards that speak 57600 baud
 SPARE = 0.10
 
 
@@ -33,6 +34,7 @@ def size(elf=ELF):
             "taken": taken,
             "room": FLASH_BYTES,
             "spare": 1 - taken / FLASH_BYTES,
+            "spare_old_loader": 1 - (taken - BOOTLOADER_BYTES + OLD_BOOTLOADER_BYTES) / FLASH_BYTES,
         },
         "ram": {"bytes": data + bss, "room": RAM_BYTES},
     }
@@ -53,6 +55,16 @@ def sections(image):
     return [(name(head[0]), head[1], head[2], head[5]) for head in heads]
 
 
+def words(found):
+    """What `size` found of the flash, in one line."""
+    flash = found["flash"]
+    return (
+        f"flash: {flash['bytes']:,} of {flash['room']:,} B; with two model slots "
+        f"{100 * flash['spare']:.1f} % to spare beside Optiboot ({BOOTLOADER_BYTES} B), "
+        f"{100 * flash['spare_old_loader']:.1f} % beside the older bootloader ({OLD_BOOTLOADER_BYTES} B)"
+    )
+
+
 def safety():
     """{"irradiance_w_m2", "margin", "safety"}: sparsegaze.eyesafety's report of the default headset."""
     from sparsegaze.eyesafety import examine
@@ -60,3 +72,7 @@ def safety():
 
     report = examine(load_headset(HEADSET)).report()
     return {"irradiance_w_m2": report["irradiance_w_m2"], "margin": report["margin"], "safety": report}
+
+
+if __name__ == "__main__":
+    print(words(size()))
