@@ -93,7 +93,7 @@ def status(port, as_json):
 def linearity(port, as_json):
     """Self-calibration: measure and store how charge and converter code bend at each sensor of PORT.
 
-    Takes 20 s, best before `calibrate`, with the headset on and looking straight ahead, or before white
+    Takes 35 s, best before `calibrate`, with the headset on and looking straight ahead, or before white
     paper: the light must be steady. Exposures alternate between long ones and fractions of these;
     what a sensor then reads must not change. Shifts are of a quarter of the exposure against the whole, in
     percent of the light and in octaves.

@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Curves and the converter's zero, by least squares, from exposures that alternated before a resting light.
 
-Charge goes by code (1 + c code / 1024), with a c of its own for every sensor. A converter that would read less
-than 0 at 0 V has its zero z below 0: in the dark it reads |z| codes too few lit, and 0 unlit, which tells
-nothing. One converter reads all six sensors, so z is one number; what it costs a sensor also depends on how
-much comes unlit.
+Charge goes by code (1 + c code / 1024), with a c of its own for every sensor. A pair's second starts from
+what the sample capacitor brought from the first, which is linear: its own light is what is left of it. A
+converter that would read less than 0 at 0 V has its zero z below 0: in the dark it reads |z| codes too few
+lit, and 0 unlit. One converter reads all six sensors, so z is one number, told by unlit codes
+(converter.py); where none of them comes up from 0, by what remains of the curves.
+
+The converter's own non-linearity, half a code of any shape, is no curve. An offset beside each curve keeps
+the long exposures, all others' reference, from weighing more than these: what remains is least over all
+levels.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtr
 
+from . import converter
 from .errors import CalibrationError
 
 CHANNELS = 6
@@ -21,15 +26,16 @@ STEADY_SHARE = 0.5  # of the short exposures that must be usable
 CURVE_STEPS = 127
 CURVE_SD = 0.03  # of parts, as far as they are known: curves that the data do not tell stay small
 ZERO_SD = 2.0  # codes, likewise
-ZEROS = -np.arange(0.0, 8.1, 0.25)
+STATIC_OCTAVES = 0.0015  # of a level, by the converter's non-linearity
 NOMINAL = 0.05  # the curve that the firmware takes off for every part, to first order
-NOISE_CODES, HIDDEN = 0.65, -1.0  # of one conversion; a level below that hardly shows in codes that stop at 0
+SHARE = 0.318  # of the sample capacitor in a node: what a pair's second keeps of its first
+ALONE = (-1,) * CHANNELS
 
 
 class Hold(NamedTuple):
     """Frames with one set of exposures; arrays [6] of each channel's mean.
 
-    t_us mid time; octaves log2 photocurrent; lit, unlit codes; exposure_us; full: the long exposures
+    t_us mid time; octaves log2 photocurrent; lit, unlit codes; exposure_us; full: the long exposures; frames
     """
 
     t_us: float
@@ -38,6 +44,7 @@ class Hold(NamedTuple):
     unlit: np.ndarray
     exposure_us: np.ndarray
     full: bool
+    frames: int = 16
 
 
 class Fit(NamedTuple):
@@ -46,6 +53,7 @@ class Fit(NamedTuple):
     curve [6]; zero_codes, 0 or less
     shift_octaves [6]  of a quarter of the exposure against all of it, under curve and zero that were in force
     noise_octaves [6]  standard error of that;  used, given: short exposures
+    left_octaves [6]   what `curve` and `zero_codes` would have left of the shift
     """
 
     curve: np.ndarray
@@ -54,92 +62,155 @@ class Fit(NamedTuple):
     noise_octaves: np.ndarray
     used: int
     given: int
+    left_octaves: np.ndarray
 
 
-def fit(holds, curve, zero_codes):
+def fit(holds, curve, zero_codes, dark=(), before=ALONE, wanted=None):
     """Fit of Holds that were measured with `curve` [6] and zero_codes in force.
 
     A short exposure lies between two long ones; d = log2 of its photocurrent over theirs, interpolated to its
     time. True curves and zero would have left nothing of d but noise.
+    dark     further Holds, of which only unlit codes count: of long exposures
+    before   [6] channel sampled right before each, -1: none
+    wanted   (curve, zero codes) to judge by left_octaves instead of those found
     Raises CalibrationError when too few of the exposures are usable.
     """
-    triples = [(a, b, c) for a, b, c in zip(holds, holds[1:], holds[2:]) if a.full and c.full and not b.full]
-    if not triples:
-        raise CalibrationError("the device did not change its exposures", "restart it and try again")
-    use = _usable(triples)
-    triples = [triple for triple, good in zip(triples, use) if good]
-    share = np.array([(b.t_us - a.t_us) / (c.t_us - a.t_us) for a, b, c in triples])[:, None]
+    pair = _Pair(holds, np.asarray(curve, float), zero_codes, dark, np.asarray(before))
+    zero = min(range(len(converter.ZEROS)), key=pair.cost)
+    found = [pair.solve(i, zero)[0] for i in range(CHANNELS)]
+    steps = np.clip(np.round(1024 * np.array(found)), -CURVE_STEPS, CURVE_STEPS) / 1024
+    zero_codes = min(float(converter.ZEROS[zero]), 0.0)
+    shift, noise = pair.quarter(pair.d)
+    left, _ = pair.quarter(pair.with_others(zero, *(wanted or (steps, zero_codes))))
+    return Fit(steps, zero_codes, shift, noise, len(pair.d), pair.given, left)
 
-    def of(name):
-        """(short, long) [n, 6] of a field of Hold."""
-        first, short, last = (np.array([getattr(t[i], name) for t in triples]) for i in range(3))
-        return short, (1 - share) * first + share * last
 
-    octaves, lit, unlit, exposure = (of(name) for name in ("octaves", "lit", "unlit", "exposure_us"))
-    d = octaves[0] - octaves[1]
-    pair = _Pair(d, lit, unlit, exposure, np.asarray(curve, float), zero_codes)
-    best = min(ZEROS, key=pair.cost)
-    found = np.array([pair.solve(i, best)[0] for i in range(CHANNELS)])
-    steps = np.clip(np.round(1024 * found), -CURVE_STEPS, CURVE_STEPS)
-    quarter = np.abs(pair.ratio - pair.ratio.min(axis=0)) < 0.08
-    shift = np.array([np.median(d[rows, i]) for i, rows in enumerate(quarter.T)])
-    spread = [np.median(np.abs(d[rows, i] - shift[i])) for i, rows in enumerate(quarter.T)]
-    noise = 1.2533 * 1.4826 * np.array(spread) / np.sqrt(quarter.sum(axis=0))
-    return Fit(steps / 1024, float(best), shift, noise, len(triples), len(use))
+class _Side:
+    """Short exposures, or the long ones around them: lit, unlit codes, exposure_us [n, 6]."""
+
+    def __init__(self, lit, unlit, exposure_us, before):
+        self.lit, self.unlit, self.exposure_us = lit, unlit, exposure_us
+        self.x = (lit + unlit) / 1024
+        self.first, self.second = np.maximum(before, 0), before >= 0
+
+    def levels(self, zero, rate):
+        """Unlit codes as they would be if codes went below 0."""
+        made = zero + rate * self.exposure_us
+        return np.where(made < converter.PLAIN_CODES, np.minimum(made, self.unlit + 1.0), self.unlit)
+
+    def charge(self, i, levels, curve):
+        """(charge [n] of channel i's own light in codes, its slope by the curve) for unlit levels [n, 6]."""
+        ours = self.lit[:, i] - levels[:, i]
+        first = self.first[i]
+        brought = SHARE * (self.lit[:, first] - levels[:, first]) if self.second[i] else 0.0
+        charge = np.maximum(ours * (1 + (NOMINAL + curve) * self.x[:, i]) - brought, 1.0)
+        return charge, ours * self.x[:, i]
 
 
 class _Pair:
     """Short exposures [n, 6] against the long ones around them, and what curves and a zero make of them."""
 
-    def __init__(self, d, lit, unlit, exposure, curve, zero):
-        self.d, self.old, self.zero = d, curve, zero
-        self.x = [(a + b) / 1024 for a, b in zip(lit, unlit)]
-        self.ours = [np.maximum(a - b, 1.0) for a, b in zip(lit, unlit)]
-        self.ratio = exposure[0] / exposure[1]
-        self.long_level = _level(unlit[1].mean(axis=0))
-        self.level = np.empty_like(d)
-        for i, fraction in enumerate(np.round(self.ratio.T, 1)):
-            for value in np.unique(fraction):
-                rows = fraction == value
-                self.level[rows, i] = _level(unlit[0][rows, i].mean())
+    def __init__(self, holds, curve, zero, dark, before):
+        threes = zip(holds, holds[1:], holds[2:])
+        triples = [(a, b, c) for a, b, c in threes if a.full and c.full and not b.full]
+        if not triples:
+            raise CalibrationError("the device did not change its exposures", "restart it and try again")
+        self.given = len(triples)
+        triples = [triple for triple, good in zip(triples, _usable(triples)) if good]
+        share = np.array([(b.t_us - a.t_us) / (c.t_us - a.t_us) for a, b, c in triples])[:, None]
+
+        def of(name):
+            """(short, long) [n, 6] of a field of Hold."""
+            first, short, last = (np.array([getattr(t[i], name) for t in triples]) for i in range(3))
+            return short, (1 - share) * first + share * last
+
+        fields = {name: of(name) for name in ("octaves", "lit", "unlit", "exposure_us")}
+        self.d = fields["octaves"][0] - fields["octaves"][1]
+        self.sides = [
+            _Side(*(fields[name][k] for name in ("lit", "unlit", "exposure_us")), before) for k in range(2)
+        ]
+        self.ratio = fields["exposure_us"][0] / fields["exposure_us"][1]
+        self.rung = np.unique(np.round(np.median(self.ratio, axis=1), 2), return_inverse=True)[1]
+        self.old, self.zero = curve, zero
+        every = [*holds, *dark]
+        self.unlit = converter.unlit(
+            np.array([hold.exposure_us for hold in every]),
+            np.array([hold.unlit for hold in every]),
+            [hold.frames for hold in every],
+        )
+        self.reads = {}
         self.spread = np.ones(CHANNELS)
-        rest = [self.solve(i, zero)[1] for i in range(CHANNELS)]
+        start = int(self.unlit.cost.argmin())
+        rest = [self.solve(i, start)[1] for i in range(CHANNELS)]
         self.spread = np.array([max(1.4826 * np.median(np.abs(r - np.median(r))), 1e-5) for r in rest])
 
-    def missing(self, i, zero):
-        """log2 of what the device makes too little of short over long light, if the true zero is this."""
-        long = max(self.long_level[i], zero)
-        # Where the unlit code shows its level, that; else what comes unlit grows with the exposure.
-        hidden = np.clip(zero + self.ratio[:, i] * (long - zero), zero, HIDDEN)
-        short = np.where(self.level[:, i] > HIDDEN, np.maximum(self.level[:, i], zero), hidden)
-        made = [
-            np.log2(1 + np.maximum(self.zero - level, 0.0) / ours[:, i])
-            for level, ours in zip((short, long), self.ours)
-        ]
-        return made[0] - made[1]
+    def levels(self, zero):
+        """[2] of unlit levels [n, 6], short and long, if the true zero is ZEROS[zero]."""
+        return [side.levels(converter.ZEROS[zero], self.unlit.rate[zero]) for side in self.sides]
+
+    def taken(self, levels, zero_codes):
+        """What the device takes levels for with zero_codes in force."""
+        if zero_codes not in self.reads:
+            self.reads[zero_codes] = converter.device_reads(zero_codes)
+        near = np.interp(levels, converter.LEVELS, self.reads[zero_codes])
+        return np.where(levels < converter.LEVELS[-1], near, levels)
+
+    def made(self, i, zero, curve, zero_codes):
+        """log2 of short over long light [n] of channel i, as the device makes it with these in force."""
+        return self._octaves(i, [self.taken(level, zero_codes) for level in self.levels(zero)], curve)[0]
+
+    def _octaves(self, i, levels, curve):
+        """(log2 of short over long charge [n], its slope by the curve)."""
+        short, long = (side.charge(i, level, curve) for side, level in zip(self.sides, levels))
+        slope = (short[1] / short[0] - long[1] / long[0]) / np.log(2)
+        return np.log2(short[0] / long[0]), slope
 
     def solve(self, i, zero):
-        """(curve, what it leaves [n]) of one channel for a zero; outliers weigh less."""
-        bend = [np.log2(1 + (NOMINAL + self.old[i]) * x[:, i]) for x in self.x]
-        d = self.d[:, i] + self.missing(i, zero) - bend[0] + bend[1]
-        c = NOMINAL + self.old[i]
+        """(curve, what it leaves [n]) of one channel for ZEROS[zero]; outliers weigh less."""
+        d = self.d[:, i] - self.made(i, zero, self.old[i], self.zero)
+        levels, c, offset = self.levels(zero), self.old[i], 0.0
+        whole = len(d) / (self.rung.max() + 1) / self.spread[i] ** 2  # the long exposures are a rung too
         for _ in range(6):
-            short, long = (x[:, i] for x in self.x)
-            rest = d + np.log2(1 + c * short) - np.log2(1 + c * long)
-            slope = (short / (1 + c * short) - long / (1 + c * long)) / np.log(2)
-            weight = 1 / np.maximum(1.0, np.abs(rest) / (2 * self.spread[i])) / self.spread[i] ** 2
-            push = (weight * slope) @ rest + (c - NOMINAL) / CURVE_SD**2
-            c = float(np.clip(c - push / ((weight * slope) @ slope + CURVE_SD**-2), -0.2, 0.3))
-        return c - NOMINAL, rest
+            octaves, slope = self._octaves(i, levels, c)
+            rest = d + octaves
+            weight = 1 / np.maximum(1.0, np.abs(rest - offset) / (2 * self.spread[i])) / self.spread[i] ** 2
+            a = np.array([
+                [(weight * slope) @ slope + CURVE_SD**-2, -(weight @ slope)],
+                [-(weight @ slope), weight.sum() + whole],
+            ])
+            off = rest - offset
+            b = [(weight * slope) @ off + c / CURVE_SD**2, whole * offset - weight @ off]
+            push = np.linalg.solve(a, b)
+            c, offset = float(np.clip(c - push[0], -0.25, 0.25)), float(offset - push[1])
+        return c, d + self._octaves(i, levels, c)[0]
 
     def cost(self, zero):
-        """Misfit of the best curves for a zero, in deviations squared, outliers counted linearly."""
-        total = ((zero - self.zero) / ZERO_SD) ** 2
+        """Misfit of ZEROS[zero] and the best curves, in deviations squared."""
+        total = self.unlit.cost[zero] + ((min(converter.ZEROS[zero], 0.0) - self.zero) / ZERO_SD) ** 2
+        if total > self.unlit.cost.min() + 100:
+            return total
         for i in range(CHANNELS):
             curve, rest = self.solve(i, zero)
-            r = np.abs(rest) / self.spread[i]
-            total += float(np.sum(np.where(r < 2, r**2, 4 * r - 4))) + (curve / CURVE_SD) ** 2
-        return total
+            total += (curve / CURVE_SD) ** 2
+            for k in range(self.rung.max() + 1):
+                rows = rest[self.rung == k]
+                total += np.median(rows) ** 2 / (STATIC_OCTAVES**2 + 1.57 * self.spread[i] ** 2 / len(rows))
+        return float(total)
+
+    def with_others(self, zero, curve, zero_codes):
+        """d [n, 6] as another curve [6] and zero in force would have made it; ZEROS[zero] is the true one."""
+        change = [
+            self.made(i, zero, curve[i], zero_codes) - self.made(i, zero, self.old[i], self.zero)
+            for i in range(CHANNELS)
+        ]
+        return self.d + np.array(change).T
+
+    def quarter(self, d):
+        """(median of d over the shortest exposures, standard error), [6] each."""
+        rows = np.abs(self.ratio - self.ratio.min(axis=0)) < 0.08
+        shift = np.array([np.median(d[use, i]) for i, use in enumerate(rows.T)])
+        spread = [np.median(np.abs(d[use, i] - shift[i])) for i, use in enumerate(rows.T)]
+        return shift, 1.2533 * 1.4826 * np.array(spread) / np.sqrt(rows.sum(axis=0))
 
 
 def _usable(triples):
@@ -155,12 +226,3 @@ def _usable(triples):
             "look straight ahead and hold the headset still, or put white paper before it; then try again",
         )
     return use
-
-
-def _level(mean):
-    """What codes that stop at 0 are the mean of, below 0 as far as noise shows it; below HIDDEN: -100."""
-    level = np.arange(-3.0, 12.0, 0.02)
-    x = level / NOISE_CODES
-    clipped = level * ndtr(x) + NOISE_CODES * np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
-    found = np.where(mean > 10, mean, np.interp(mean, clipped, level))
-    return np.where(found < HIDDEN, -100.0, found)

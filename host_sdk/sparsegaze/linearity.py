@@ -3,19 +3,20 @@
 
 A node's capacitance changes with its voltage, so charge is not quite proportional to the converter's code:
 charge = code (1 + c code / 1024), with a c of its own for every part; and a converter that would read less
-than 0 at 0 V reads too few codes lit and cannot say so unlit. Exposures alternate quickly between the
-long ones and fractions of these; a short one lies between two long ones, whose readings are interpolated
-to its time, so that light which drifts (an eye, a pupil) cancels. What is left comes from c and from that
-zero, which are fitted by least squares.
+than 0 at 0 V reads too few codes lit and cannot say so unlit. Unlit codes of long exposures tell that zero.
+Exposures alternate quickly between long ones and fractions of these; a short one lies between two long ones,
+whose readings are interpolated to its time, so that light which drifts (an eye, a pupil) cancels. What is
+left comes from c, which is fitted by least squares.
 """
 
+import contextlib
 from typing import NamedTuple
 
 import numpy as np
 
 from . import curvefit, faults
 from .curvefit import Hold
-from .errors import CalibrationError
+from .errors import CalibrationError, SparsegazeError
 from .sensing import EXPOSURE_REST_S, wait_stored
 from .wire import lib
 
@@ -24,11 +25,17 @@ FRACTIONS = (0.25, 0.5, 0.35, 0.71)  # of the long exposures
 HOLD_US = 40_000  # one exposure; four waves of 100 Hz flicker
 SKIP_FRAMES = 3  # after a change: ambient light is interpolated from earlier cycles
 FRAMES_LEAST = 4
-ROUNDS, CHECK_ROUNDS = 48, 20  # through all fractions: 15 s, 6 s
+ROUNDS, VERIFY_ROUNDS, CHECK_ROUNDS = 48, 16, 16  # through all fractions: 15 s, 5 s, 5 s
+DARK_FRACTIONS, DARK_ROUNDS = (1.0, 0.6, 0.35, 0.2), 8  # of the longest exposures, for unlit codes: 1.3 s
+BEFORE = {  # channel sampled right before each, by enum sg_wiring; -1: ground
+    lib.SG_WIRING_LEDS: (5, -1, -1, 2, 1, -1),
+    lib.SG_WIRING_PHOTODIODES: (-1, -1, -1, 0, 1, 2),
+}
 CODE_LEAST = 120  # of our light, at the long exposure: below, a quarter of it says nothing
 CALM_US, CALM_LIMIT_US = 500_000, 6_000_000
 RATE_HZ = 500
-CODE_WANTED, LOOK_US = 700.0, 150_000  # lit, at the long exposures
+CODE_WANTED = 600.0  # lit, at the long exposures: automatic ones hardly read more, blinks apart
+LOOK_US = 150_000
 AMBIENT_MOVE = 0.15  # of our own light: more, and the light was not steady
 BETTER_SHARE = 0.9  # a second measurement must find at most this much of the shift, or only noise
 
@@ -75,50 +82,68 @@ def percent(octaves):
 
 
 def run(device, progress=None):
-    """Measure the curves of an open device's channels, store them, measure again. Returns Linearity.
+    """Find the curves of an open device's channels, verify, store them, measure again. Returns Linearity.
 
-    The light need not be known, only steady: an eye that looks straight ahead, or a sheet of paper. Exposures
-    and settings are afterwards what they were. progress  called as progress(stage, done, total)
+    The light need not be known, only steady: an eye that looks straight ahead, or a sheet of paper. Curves
+    are stored only once exposures that had no part in finding them agree; and taken back if the device's own
+    features then do not. Exposures and settings are afterwards what they were.
+    progress  called as progress(stage, done, total)
     Raises CalibrationError, with nothing changed, when a channel is at fault, the light too weak or unsteady.
     """
     faults.refuse(device)
-    settings, exposure = device.settings(), device.exposure()
-    stored = device.curve()
-    old, changed = np.array(stored.curve), False
+    settings, exposure, stored = device.settings(), device.exposure(), device.curve()
+    changed = False
     # Frames enough in HOLD_US, however slowly the device is set to sense; both streams must fit on the line.
     device.settings(rate_hz=RATE_HZ, repeats=1, rolling=False, power="normal")
     try:
         device.set_stream(raw=True, counts=True)
-        long_us = _settle(device, progress)
-        whole = ROUNDS + CHECK_ROUNDS
+        before = BEFORE[settings.wiring]
+        whole = ROUNDS + VERIFY_ROUNDS + CHECK_ROUNDS
         say = (lambda part: progress("linearity", part, whole)) if progress else (lambda part: None)
-        holds = measure(device, long_us, ROUNDS, say)
-        check_steady(holds)
-        first = curvefit.fit(holds, old, stored.zero_codes)
-        now = device.curve(first.curve, first.zero_codes)
-        changed = True
-        again = measure(device, long_us, CHECK_ROUNDS, lambda part: say(ROUNDS + part))
-        check_steady(again)
-        second = curvefit.fit(again, now.curve, now.zero_codes)
-        noise = np.hypot(first.noise_octaves, second.noise_octaves)
-        shifts = first.shift_octaves, second.shift_octaves
-        kept = _better(*shifts, noise)
-        changed = not kept
-        codes = np.mean([hold.lit - hold.unlit for hold in holds if hold.full], axis=0)
-        curve, zero = (first.curve, first.zero_codes) if kept else (old, stored.zero_codes)
-        return Linearity(*shifts, noise, old, curve, kept, codes, stored.zero_codes, zero)
-    finally:
-        written = device.status().eeprom_writes
-        if changed:
-            device.curve(old, stored.zero_codes)
-        if exposure.automatic:
-            device.exposure(auto=True)
-        else:
-            device.exposure(us=exposure.exposure_us)
-        device.set_stream()
-        device.settings_back(settings)
-        device.link.sleep(EXPOSURE_REST_S)
-        wait_stored(device, written)
+        long_us = _settle(device, progress)
+        dark = measure_dark(device)
+
+        def look(done, rounds, now, wanted=None):
+            holds = measure(device, long_us, rounds, lambda part: say(done + part))
+            check_steady(holds)
+            return holds, curvefit.fit(holds, now.curve, now.zero_codes, dark, before, wanted)
+
+        holds, first = look(0, ROUNDS, stored)
+        found = first.curve, first.zero_codes
+        _, second = look(ROUNDS, VERIFY_ROUNDS, stored, found)
+        noise, after = np.hypot(first.noise_octaves, second.noise_octaves), second.left_octaves
+        kept = _better(first.shift_octaves, after, noise)
+        if kept:
+            changed = True
+            now = device.curve(*found)
+            _, second = look(ROUNDS + VERIFY_ROUNDS, CHECK_ROUNDS, now)
+            noise, after = np.hypot(first.noise_octaves, second.noise_octaves), second.shift_octaves
+            kept = _better(first.shift_octaves, after, noise)
+            changed = not kept
+    except BaseException:
+        with contextlib.suppress(SparsegazeError):  # what went wrong first is what is told
+            _give_back(device, settings, exposure, stored if changed else None)
+        raise
+    _give_back(device, settings, exposure, stored if changed else None)
+    codes = np.mean([hold.lit - hold.unlit for hold in holds if hold.full], axis=0)
+    old = np.array(stored.curve)
+    curve, zero = found if kept else (old, stored.zero_codes)
+    return Linearity(first.shift_octaves, after, noise, old, curve, kept, codes, stored.zero_codes, zero)
+
+
+def _give_back(device, settings, exposure, curve):
+    """Settings, exposures and, if not None, curves as they were; returns once they are stored."""
+    written = device.status().eeprom_writes
+    if curve is not None:
+        device.curve(curve.curve, curve.zero_codes)
+    if exposure.automatic:
+        device.exposure(auto=True)
+    else:
+        device.exposure(us=exposure.exposure_us)
+    device.set_stream()
+    device.settings_back(settings)
+    device.link.sleep(EXPOSURE_REST_S)
+    wait_stored(device, written)
 
 
 def _better(before, after, noise):
@@ -132,9 +157,20 @@ def measure(device, long_us, rounds, say=lambda part: None):
 
     device streams raw and counts; say(rounds done) is called as it goes on.
     """
-    long_us = np.asarray(long_us, float)
-    least_us = device.hello.exposure_min_us
     plan = [share for _ in range(rounds) for fraction in FRACTIONS for share in (1.0, fraction)] + [1.0]
+    long_us = np.asarray(long_us, float)
+    return _alternate(device, long_us, plan, lambda left: say(rounds - left // (2 * len(FRACTIONS))))
+
+
+def measure_dark(device):
+    """Holds of the longest exposures and fractions of these, for their unlit codes; lit ones may be full."""
+    longest_us = device.exposure(us=[device.hello.exposure_max_us] * 6).exposure_us
+    return _alternate(device, np.array(longest_us, float), DARK_FRACTIONS * DARK_ROUNDS, lambda left: None)
+
+
+def _alternate(device, long_us, plan, say):
+    """Holds of long_us times every share of `plan`; say(shares left) is called as it goes on."""
+    plan, least_us = list(plan), device.hello.exposure_min_us
     rows, until = [], None
     for frame in device.frames():
         if until is None or frame.t_us >= until:
@@ -142,7 +178,7 @@ def measure(device, long_us, rounds, say=lambda part: None):
                 break
             device.exposure(us=np.maximum(long_us * plan.pop(0), least_us))
             until = frame.t_us + HOLD_US
-            say(rounds - len(plan) // (2 * len(FRACTIONS)))
+            say(len(plan))
         if frame.raw is not None and frame.counts is not None:
             rows.append(frame)
     return _holds(rows, long_us)
@@ -221,6 +257,7 @@ def _holds(rows, long_us):
                         np.mean([frame.counts.unlit_code for frame in kept], axis=0),
                         exposure,
                         bool(np.median(exposure / long_us) > 0.85),
+                        len(kept),
                     )
                 )
             run = []

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-calibration of linearity: finds the curves past a drifting eye and ambient light; refuses bad light."""
+"""Self-calibration of linearity: finds curves past a drifting eye and ambient light; refuses bad light."""
 
 import numpy as np
 import pytest
-from bent_sensor import FULL, BentSensor
+from bent_sensor import CARRIED, FIRST, FULL, SECOND, BentSensor
 
 from sparsegaze import curvefit, linearity
-from sparsegaze.errors import CalibrationError
+from sparsegaze.errors import CalibrationError, DisconnectedError
 from sparsegaze.wire import lib
 
 BEND = np.array([0.020, -0.015, 0.05, 0.0, -0.04, 0.01])
@@ -35,6 +35,7 @@ def test_finds_every_curve_and_takes_the_shift_away(wander, ambient):
     assert np.abs(np.array(device.curves) / 1024 - done.curve).max() < 1e-9
     # Of codes that add up so to a quarter of them, to first order.
     wanted = BEND * (done.codes * (1 + 2 * ambient / FULL)) / 1024 * 0.75 / np.log(2)
+    wanted[SECOND] /= 1 - CARRIED * done.codes[FIRST] / done.codes[SECOND]  # what is their own bends no less
     assert np.abs(done.before - wanted).max() < 0.25 * np.abs(wanted).max()
     assert np.abs(done.after).max() < 0.003 < np.abs(done.before).max()
     assert device.automatic and device.stream[-1] == (False, False, False)
@@ -49,7 +50,10 @@ class Paced(BentSensor):
         return now
 
 
-@pytest.mark.parametrize("slow", [{"rate_hz": 60, "power": "low"}, {"repeats": 16}], ids=["60Hz", "mean of 16"])
+SLOW = [{"rate_hz": 60, "power": "low"}, {"repeats": 16}]
+
+
+@pytest.mark.parametrize("slow", SLOW, ids=["60Hz", "mean of 16"])
 def test_a_board_that_is_set_to_sense_slowly_is_measured_fast_and_stays_slow(slow):
     device = Paced(BEND)
     device.settings(**slow)
@@ -68,7 +72,7 @@ def test_a_converter_whose_zero_is_off_is_not_taken_for_curvature(zero):
     assert found.zero == pytest.approx(min(zero, 0.0), abs=0.3) == device.zero_q2 / 4
     assert np.abs(found.after).max() < 0.004 < np.abs(found.before).max()
     again = linearity.run(device)
-    assert again.kept and again.zero == pytest.approx(found.zero, abs=0.3)
+    assert again.zero == pytest.approx(found.zero, abs=0.3) and np.abs(again.curve - BEND).max() < 0.005
 
 
 def test_a_zero_that_was_found_in_the_dark_stays_in_the_light():
@@ -138,12 +142,82 @@ def test_settings_and_held_exposures_are_given_back():
     assert device.sensing["repeats"] == 4 and not device.automatic and device.exposures == (800,) * 6
 
 
-def test_curves_that_are_no_better_are_not_kept(monkeypatch):
-    device = BentSensor(BEND, frame_us=1999)
+class Watched(BentSensor):
+    """Writes down when curves were stored: `sets`, (t_us, curves)."""
+
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self.sets = []
+
+    def curve(self, curve=None, zero_codes=None):
+        now = super().curve(curve, zero_codes)
+        if curve is not None or zero_codes is not None:
+            self.sets.append((self.t_us, now.curve_q10))
+        return now
+
+
+def test_curves_that_are_no_better_are_never_stored(monkeypatch):
+    device = Watched(BEND, frame_us=1999)
     honest = curvefit.fit
-    monkeypatch.setattr(curvefit, "fit", lambda *args: honest(*args)._replace(curve=-BEND))
+
+    def wrong(holds, curve, zero, dark, before, wanted):
+        wanted = None if wanted is None else (-BEND, wanted[1])
+        return honest(holds, curve, zero, dark, before, wanted)._replace(curve=-BEND)
+
+    monkeypatch.setattr(curvefit, "fit", wrong)
     done = linearity.run(device)
-    assert not done.kept and device.curves == (0,) * 6
+    assert not done.kept and device.sets == [] and device.curves == (0,) * 6
+    assert np.sqrt(np.mean(done.after**2)) > 1.5 * np.sqrt(np.mean(done.before**2))
+
+
+def test_curves_are_stored_once_other_exposures_agree_and_a_pulled_cable_leaves_the_old_ones():
+    device = Watched(BEND, frame_us=1999)
+    linearity.run(device)
+    [(stored_us, found)] = device.sets
+    took_us = (linearity.ROUNDS + linearity.VERIFY_ROUNDS) * 2 * len(linearity.FRACTIONS) * linearity.HOLD_US
+    assert stored_us - 2_000_000 > took_us and np.abs(np.array(found) / 1024 - BEND).max() < 0.004
+    for pulled_us in (stored_us - 6_000_000, stored_us - 100_000):
+        device = Watched(BEND, frame_us=1999, unplug_us=pulled_us)
+        with pytest.raises(DisconnectedError):
+            linearity.run(device)
+        assert device.sets == [] and device.curves == (0,) * 6
+
+
+class Fickle(Watched):
+    """Its parts change when a curve is stored: what was found is none of theirs."""
+
+    def curve(self, curve=None, zero_codes=None):
+        if curve is not None:
+            self.bend = -2 * BEND
+        return super().curve(curve, zero_codes)
+
+
+def test_the_old_curves_come_back_if_the_device_s_own_features_disagree():
+    device = Fickle(BEND, frame_us=1999)
+    done = linearity.run(device)
+    assert not done.kept and len(device.sets) == 2 and device.curves == (0,) * 6
+    assert done.curve == pytest.approx(np.zeros(6)) and device.automatic
+
+
+class Gone(BentSensor):
+    """Answers no status once it streams: the cable is pulled right after the light was found unsteady."""
+
+    def status(self):
+        if self.stream:
+            raise DisconnectedError("/dev/fake is gone", "check the cable")
+        return super().status()
+
+
+def test_what_went_wrong_first_is_what_is_told():
+    device = Gone(BEND, light=0.03, frame_us=1999)
+    with pytest.raises(CalibrationError, match="too little light"):
+        linearity.run(device)
+
+
+def test_without_leakage_or_light_around_the_curves_tell_the_zero():
+    device = BentSensor(BEND, zero=-2.0, leakage=(0.0,) * 6, frame_us=1999)
+    found = linearity.run(device)
+    assert found.kept and -3.0 <= found.zero <= -1.25 and np.abs(found.curve - BEND).max() < 0.006
 
 
 def test_the_command_reports_percent_and_octaves(command, command_json, monkeypatch):

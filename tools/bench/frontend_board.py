@@ -24,6 +24,8 @@ ROOT = Path(__file__).resolve().parents[2]
 FIRMWARE = ROOT / "host_sdk" / "sparsegaze" / "data" / "firmware.hex"
 SOURCES = (
     "linearity",
+    "curvefit",
+    "converter",
     "calibrate",
     "capture",
     "session",
