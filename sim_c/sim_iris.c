@@ -256,7 +256,7 @@ int sim_add_iris(const struct sim_scene *scene, struct sim_light *light, const d
         iris->folds[k] = sim_cornea_folds(eye, sites[k]);
         if (iris->folds[k]) {
             iris->edge_of[k] = &edges[iris->n_edges++];
-            sim_cornea_edge(eye, sites[k], iris->edge_of[k]);
+            sim_edge_find(eye, sites[k], iris->edge_of[k]);
         }
         iris->uneven |= iris->folds[k] > 1 || !scene->face.eye_clear[k];
     }

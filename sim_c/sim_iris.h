@@ -5,6 +5,7 @@
 #define SIM_IRIS_H
 
 #include "sim_cornea.h"
+#include "sim_edge.h"
 
 enum { SIM_PROBE_STEPS = 3, SIM_SHADOW_STEPS = 5, SIM_ROW_EDGES = 32 };
 

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// B-splines of response maps along one axis. For sim_map.c only, which whoever reads maps compiles alone:
-// therefore a header.
+// B-splines of response maps along one axis: knots for sim_map_file.c, values and slopes for sim_map.c.
 #ifndef SIM_MAP_SPLINE_H
 #define SIM_MAP_SPLINE_H
 

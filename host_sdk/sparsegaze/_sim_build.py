@@ -18,6 +18,7 @@ SIM_C = os.path.normpath(os.path.join(HERE, "..", "..", "sim_c"))
 HEADERS = ("sim_map.h", "sim_eye.h", "sim_scene.h", "sim_image.h", "sim_osmesa.h")
 SOURCES = (
     "sim_map.c",
+    "sim_map_file.c",
     "sim_eye.c",
     "sim_lid.c",
     "sim_face.c",
@@ -29,6 +30,7 @@ SOURCES = (
     "sim_surface.c",
     "sim_sclera.c",
     "sim_cornea.c",
+    "sim_edge.c",
     "sim_iris.c",
     "sim_iris_row.c",
     "sim_glint.c",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writer of response map files (`.sgmap`): sim_c/sim_map.h states the format, sim_map.c reads it."""
+"""Writer of response map files (`.sgmap`): sim_c/sim_map.h states the format, sim_map_file.c reads it."""
 
 import os
 import struct
