@@ -59,6 +59,15 @@ def open_screen(device, window):
         shown.close()
 
 
+def _has_rows(path):
+    """True when a recording holds a frame: behind comments and the line of names."""
+    try:
+        with open(path, encoding="utf-8") as file:
+            return any(line[:1].isdigit() for line in file)
+    except OSError:
+        return False
+
+
 def _accuracy_lines(report):
     accuracy, stream = report["accuracy"], report["stream"]
     items = [
@@ -141,6 +150,8 @@ def calibrate(
         sparsegaze calibrate /dev/ttyUSB0 --distance-mm 550 --width-mm 598
     """
     from . import calibrate as module
+    from . import choose
+    from .fitreport import rate_words
 
     console = Console(as_json)
     folder = save or os.path.join("calibrations", time.strftime("%Y%m%d-%H%M%S"))
@@ -159,7 +170,8 @@ def calibrate(
             )
     except BaseException as error:
         kept = os.path.join(folder, module.RECORDING)
-        if os.path.exists(kept) and kept not in getattr(error, "remedy", "") + getattr(error, "message", ""):
+        told = getattr(error, "remedy", "") + getattr(error, "message", "")
+        if _has_rows(kept) and kept not in told:
             console.note(f"the recording is kept in {kept}: sparsegaze fit takes it")
         raise
     report = done.report()
@@ -169,6 +181,7 @@ def calibrate(
         [
             ("targets", f"{report['used_targets']} of {report['n_targets']} used"),
             ("model", f"{report['n_vectors']} vectors, crc 0x{report['crc_host']:08X}, kept in {folder}"),
+            ("rate", "up to " + rate_words(choose.rates_hz(report["n_vectors"]))),
         ]
     )
     console.result(report, *lines, *(_accuracy_lines(report) if "accuracy" in report else []))

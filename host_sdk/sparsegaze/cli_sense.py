@@ -50,7 +50,7 @@ class Microseconds(click.ParamType):
         except ValueError:
             numbers = ()
         if len(numbers) not in (1, CHANNELS) or not all(0 < number < 4096 for number in numbers):
-            words = f"{value!r} is neither one number of microseconds nor {CHANNELS} with commas"
+            words = f"{value!r} is neither one number of 0 to 4096 microseconds nor {CHANNELS} with commas"
             self.fail(words + (", nor none" if self.none else ""), param, ctx)
         return numbers * (CHANNELS // len(numbers))
 

@@ -10,6 +10,8 @@ LOOK_CYCLES, SETTLE_MOST_S = 260, 6.0  # the last of six sensors after so many s
 LOOK_S = 0.3
 MANY = 3  # sensors at fault together have a common cause
 WRONG_READINGS = 1.0  # of the six in a frame that are too dark, or full
+# Opening the port restarts most boards, and the firmware compares the supply with what it was at its start.
+SUPPLY_VOLTS = (4.5, 5.5)
 LATE_SHARE = 0.02  # of all frames: more of them late is worth a word
 
 
@@ -111,4 +113,8 @@ def _supply(status, found):
             return Check("supply", False, fault.text, fault.remedy)
     if status.supply_volts is None:
         return Check("supply", None, "not measured", "wire the divider to A7; only to watch the voltage")
-    return Check("supply", True, f"{status.supply_volts:.2f} V, give or take 10 %")
+    volts = status.supply_volts
+    if not SUPPLY_VOLTS[0] <= volts <= SUPPLY_VOLTS[1]:
+        remedy = "measure it; use another USB port or a shorter cable, without a hub"
+        return Check("supply", None, f"{volts:.2f} V, give or take 10 %, where 5 V are expected", remedy)
+    return Check("supply", True, f"{volts:.2f} V, give or take 10 %")

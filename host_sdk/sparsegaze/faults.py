@@ -33,6 +33,7 @@ BOARD = {
         "switch them on: `sparsegaze settings {port} --lights on`",
     ),
 }
+_CAUSE = {"low": "open", "high": "short"}
 
 
 class Fault(NamedTuple):
@@ -55,7 +56,8 @@ def of(status, port="PORT"):
         text, remedy = _supply(status) if name == "supply" else BOARD[name]
         found.append(Fault(None, name, text, remedy.format(port=port)))
     for channel, names in enumerate(status.faults):
-        for name in names:
+        # Nothing at all is also far less than in the calibration, and full at once far more.
+        for name in [n for n in names if _CAUSE.get(n) not in names]:
             text, remedy = CHANNEL[name]
             remedy = remedy.format(port=port, pin=f"A{channel}")
             found.append(Fault(channel, name, f"sensor {channel} {text}", remedy))

@@ -36,9 +36,17 @@ def summary(fitted):
             held_out_rows=report["held_out_rows"],
             cycles=report["cycles"],
             rates_hz=choose.rates_hz(model.vectors),
-            predicted_rms_deg=math.hypot(report["loo_rms_deg"], report["rms_to_gp_deg"]),
+            predicted_deg=math.hypot(report["loo_mean_deg"], report["rms_to_gp_deg"]),
         )
     return plain({**out, "report": report})
+
+
+def rate_words(rates_hz):
+    """choose.rates_hz in words."""
+    return (
+        f"{rates_hz['gaze']} Hz; {rates_hz['recentred']} after a recentring, {rates_hz['features']} with the "
+        "features streamed too"
+    )
 
 
 def lines(summary):
@@ -75,9 +83,8 @@ def lines(summary):
         ),
         (
             "foreseen",
-            f"rms {summary['predicted_rms_deg']:.2f} deg from targets it was not told, at up to "
-            f"{rates['gaze']} Hz; {rates['recentred']} after a recentring, {rates['features']} with the "
-            "features streamed too",
+            f"{summary['predicted_deg']:.2f} deg in the mean from targets it was not told (at the rim more, "
+            f"inside less), at up to {rate_words(rates)}",
         ),
         (
             "its arithmetic",

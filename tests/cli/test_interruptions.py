@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 
+import pytest
 from fake_device import linear_model
 
 from sparsegaze.recording import Recording
@@ -25,6 +26,19 @@ def test_ctrl_c_in_a_calibration_says_where_the_recording_is(command, fake, tmp_
     code, out, err = command("calibrate", "PORT", "--save", tmp_path / "kept")
     assert code == 130 and out == "" and str(tmp_path / "kept" / "recording.csv") in err
     assert Recording.read(tmp_path / "kept" / "recording.csv").valid.sum() > 500
+
+
+def test_a_recording_without_a_frame_is_not_offered(command, fake, tmp_path):
+    fake().settings(lights=False)
+    code, out, err = command("calibrate", "PORT", "--save", tmp_path / "kept")
+    assert code == 1 and out == "" and "off by command" in err and "recording is kept" not in err
+
+
+def test_a_rate_out_of_reach_is_refused_before_anybody_looks_at_a_target(command, monkeypatch, tmp_path):
+    monkeypatch.setattr("sparsegaze.transport.open_link", lambda *_: pytest.fail("the port was opened"))
+    code, out, err = command("calibrate", "PORT", "--rate", "1500", "--save", tmp_path / "kept")
+    assert code == 1 and out == "" and "1500 Hz is too fast: the device does 1001 Hz at most" in err
+    assert not (tmp_path / "kept").exists()
 
 
 def test_ctrl_c_ends_a_stream_with_its_summary_and_exits_130(command_json, fake, tmp_path):

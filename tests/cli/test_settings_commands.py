@@ -165,6 +165,22 @@ def test_status_and_doctor_name_every_fault(command, command_json, fake, options
     assert [row["name"] for row in command_json("info", "PORT")[1]["faults"]] == [name]
 
 
+@pytest.mark.parametrize("fault, told", [
+    (lib.SG_FAULT_OPEN | lib.SG_FAULT_LOW, ["open"]), (lib.SG_FAULT_SHORT | lib.SG_FAULT_HIGH, ["short"]),
+    (lib.SG_FAULT_LOW, ["low"]), (lib.SG_FAULT_OPEN | lib.SG_FAULT_HIGH, ["open", "high"])])
+def test_what_follows_from_a_fault_is_not_told_as_another(command_json, fake, fault, told):
+    fake(linear_model(), fault=(0, fault, 0, 0, 0, 0))
+    assert [row["name"] for row in command_json("status", "PORT")[1]["faults"]] == told
+
+
+@pytest.mark.parametrize("volts, mark", [(4.24, "note"), (4.6, "ok "), (5.4, "ok "), (5.6, "note")])
+def test_a_supply_that_was_low_from_the_start_is_worth_a_note(command, fake, volts, mark):
+    fake(linear_model(), supply_mv=int(1000 * volts))
+    code, out, _ = command("doctor", "PORT")
+    assert code == 0 and f"{mark:<9} supply: {volts:.2f} V" in out
+    assert ("another USB port" in out) == (mark == "note")
+
+
 def test_every_bit_of_the_wire_has_words():
     assert set(FAULT_NAMES) == {1, 2, 4, 8} and set(FAULT_NAMES.values()) == set(faults.CHANNEL)
     assert set(ALARM_NAMES) == {1, 2, 4} and set(ALARM_NAMES.values()) == set(faults.BOARD) | {"supply"}

@@ -163,11 +163,11 @@ def test_fit_for_a_rate_takes_the_vectors_that_reach_it_and_says_what_to_expect(
     _, out, _ = run("-o", tmp_path / "eye.sgm", "--rate", 1000, "--json")
     data = json.loads(out)
     assert data["n_vectors"] == 15 and data["rates_hz"]["gaze"] >= 1000 > data["rates_hz"]["recentred"]
-    rms = data["leave_one_out"]["rms_deg"]
-    assert data["predicted_rms_deg"] == pytest.approx(np.hypot(rms, data["rms_to_gp_deg"])) and rms > 0
+    mean = data["leave_one_out"]["mean_deg"]
+    assert data["predicted_deg"] == pytest.approx(np.hypot(mean, data["rms_to_gp_deg"])) and mean > 0
     said = run("-o", tmp_path / "eye.sgm", "--rate", 1000)[1]
     line = next(line for line in said.splitlines() if line.startswith("foreseen"))
-    assert f"rms {data['predicted_rms_deg']:.2f} deg" in line
+    assert f"{data['predicted_deg']:.2f} deg in the mean" in line
     assert "up to 1001 Hz; 964 after a recentring" in line
 
 
