@@ -12,8 +12,10 @@ enum {
     WORTH_Q2 = 150,             // a load below it is, if it lasts
     DIM_Q2 = 40,                // and one below this, a sixth of the goal, soon
     FALL_CYCLES = 3,            // the dark of a lamp that flickers to nothing at 100 Hz is shorter
+    LOAD_LEAST = 8,
     FALL_LEAST_Q2 = 8,          // of a peak, below which a fall says nothing
     CAUTION_MOST = 6,
+    DROWNED_LEAST = 255,        // a channel that is full for ever is as short as it can be
     LEAST_MOST = 1024,          // a port that takes more instead has other reasons
     WATCH_LOOKS = 5,            // 30 ms: five phases of a period of 10 ms
 };
@@ -64,13 +66,11 @@ ONCE static uint16_t within(const struct sg_expose_led *led, uint16_t cycles)
     return clipped(cycles < least ? least : cycles, led->most_cycles);
 }
 
-// 64 * SG_EXPOSE_GOAL_CODES / load, rounded down; a load of 8 codes or more.
+// 64 * SG_EXPOSE_GOAL_CODES / load, rounded down; a load of LOAD_LEAST or more.
 static uint16_t stretch_q6(uint16_t load)
 {
     // The first three bits are 0.
     uint16_t rest = SG_EXPOSE_GOAL_CODES * 64U >> 13, quotient = (uint16_t)(SG_EXPOSE_GOAL_CODES * 512UL);
-    if (load < 8)
-        load = 8;
     for (uint8_t bit = 0; bit < 13; bit++) {
         rest = (uint16_t)((uint16_t)(rest << 1) | (quotient >> 15));
         quotient = (uint16_t)(quotient << 1);
@@ -83,9 +83,10 @@ static uint16_t stretch_q6(uint16_t load)
 }
 
 // Exposure that would have met the goal with this much unlit and this much of ours, collected in then_cycles.
-static uint16_t wanted(const struct sg_expose_led *led, uint16_t then_cycles, uint16_t unlit, uint16_t signal)
+static uint16_t wanted(const struct sg_expose_led *led, uint16_t then_cycles, uint16_t unlit, int16_t signal)
 {
-    const uint16_t stretch = stretch_q6((uint16_t)(unlit + 2U * signal));
+    const int16_t load = (int16_t)(unlit + 2 * signal);
+    const uint16_t stretch = stretch_q6(load < LOAD_LEAST ? LOAD_LEAST : (uint16_t)load);
     const uint32_t cycles = ((uint32_t)then_cycles * stretch) >> 6;
     const uint16_t whole = cycles > UINT16_MAX >> 3 ? UINT16_MAX >> 3 : (uint16_t)cycles;
     return within(led, (uint16_t)(whole - ((uint16_t)(whole * led->caution) >> 3)));
@@ -127,11 +128,11 @@ static uint8_t full(struct sg_expose_led *led, uint16_t unlit)
 // A sample that decides at once. Returns 1 if the exposure changed.
 static uint8_t acquire(struct sg_expose_led *led, uint16_t lit, uint16_t unlit, uint8_t late_cycles)
 {
-    // Twice, as the goal has the lit code.
+    // Twice, as the goal has the lit code, which may be less than the unlit one for it.
     const uint16_t then = (uint16_t)(led->exposure_cycles - 2U * late_cycles);
-    if (late_cycles > led->exposure_cycles >> 3)
+    if (late_cycles > led->exposure_cycles >> 2)
         return 0;
-    const uint16_t now = wanted(led, then, unlit, lit > unlit ? (uint16_t)(lit - unlit) : 0);
+    const uint16_t now = wanted(led, then, unlit, (int16_t)(lit - unlit));
     if (now < led->exposure_cycles - (led->exposure_cycles >> 4)
         || now > led->exposure_cycles + (led->exposure_cycles >> 2))
         return change(led, now, (uint8_t)(led->stage + 1U));
@@ -143,7 +144,7 @@ static uint8_t acquire(struct sg_expose_led *led, uint16_t lit, uint16_t unlit, 
 static uint8_t choose(struct sg_expose_led *led, uint8_t signal_q2)
 {
     const uint16_t now = wanted(led, led->exposure_cycles, (uint16_t)(led->unlit_peak << 2),
-                                (uint16_t)(signal_q2 << 2));
+                                (int16_t)(signal_q2 << 2));
     return change(led, now, SG_EXPOSE_VERIFY);
 }
 
@@ -250,8 +251,8 @@ static uint8_t visit(struct sg_expose *expose, const struct sg_reading *reading,
     if (own_reading->exposure_cycles[0] != led->exposure_cycles)
         return 0;
     uint16_t lit = own_reading->lit_code[0], unlit = own_reading->unlit_code[0];
-    // Two full without our light: so much of it came that the others will be, and all change at once.
-    if (expose->drowned >= 2 && led->stage == SG_EXPOSE_TRACK)
+    // So much light came that the others will be full too: all change at once, for a change takes cycles.
+    if (expose->drowned && led->stage == SG_EXPOSE_TRACK)
         unlit = SG_EXPOSE_SATURATED_CODE;
     if (lit >= SG_EXPOSE_SATURATED_CODE || unlit >= SG_EXPOSE_SATURATED_CODE)
         return full(led, unlit);
@@ -295,21 +296,27 @@ uint8_t sg_expose_cycle(struct sg_expose *expose, const struct sg_reading *readi
     }
     expose->next--;
     expose->drowned = 0;
-    if (!(any & 4U) && !expose->acquiring)
-        return visit(expose, reading, wiring, expose->next);
+    uint8_t changed = 0;
+    if (!(any & 4U) && !expose->acquiring) {
+        changed = visit(expose, reading, wiring, expose->next);
+        if (!changed && !expose->acquiring)
+            return 0;
+    }
     expose->acquiring = 0;
     uint8_t drowned = 0;
-    for (uint8_t i = 0; i < CHANNELS; i++)
-        drowned = (uint8_t)(drowned + (reading->unlit_code[i] >= SG_EXPOSE_SATURATED_CODE));
+    for (uint8_t i = 0; i < CHANNELS; i++) {
+        if (reading->unlit_code[i] >= SG_EXPOSE_SATURATED_CODE && reading->exposure_cycles[i] > DROWNED_LEAST)
+            drowned = 1;
+    }
     expose->drowned = drowned;
-    uint8_t changed = 0;
     for (uint8_t i = 0; i < CHANNELS; i++, code++) {
-        const uint8_t *const stage = &expose->led[i].stage;
-        // Most fit, and wait for their turn.
-        if (*stage > SG_EXPOSE_REFINE && *code < SG_EXPOSE_SATURATED_CODE && drowned < 2 && i != expose->next)
-            continue;
-        changed |= visit(expose, reading, wiring, i);
-        expose->acquiring |= *stage <= SG_EXPOSE_REFINE;
+        const struct sg_expose_led *const led = &expose->led[i];
+        // Most fit, and wait for their turn; while a change is on its way nothing says anything.
+        if ((led->stage <= SG_EXPOSE_REFINE || *code >= SG_EXPOSE_SATURATED_CODE || drowned
+             || i == expose->next)
+            && reading->exposure_cycles[i] == led->exposure_cycles)
+            changed |= visit(expose, reading, wiring, i);
+        expose->acquiring |= led->stage <= SG_EXPOSE_REFINE;
     }
     return changed;
 }

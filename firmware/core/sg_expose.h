@@ -64,7 +64,7 @@ struct sg_expose {
     uint8_t next;               // channel to look at
     uint8_t rounds;             // of looks, mod SG_EXPOSE_PATIENCE_ROUNDS
     uint8_t times;              // that they were full, mod SG_EXPOSE_PATIENCE_TIMES
-    uint8_t drowned;            // channels of this cycle that are full without our light
+    uint8_t drowned;            // 1: a channel of this cycle is full without our light
 };
 
 // Begin at these exposures (clipped), with these limits. To hold exposures, start them there and call only

@@ -15,6 +15,7 @@ from sparsegaze.timing import LATE_CYCLES, Timing
 from sparsegaze.wire import lib
 from worn import CYCLES_PER_US, LIGHT, PERSON, PLACES, Worn, calibrated, flags, gazes, jitter
 
+FIELD = ((0, 0), (-12, -12), (12, -12), (-12, 12), (12, 12))
 PULSE_CYCLES = Timing().lit_cycles(LATE_CYCLES)      # what eye safety assumes at full rate, whatever comes
 
 
@@ -178,33 +179,38 @@ def test_a_step_of_a_thousand_in_the_middle_of_an_exposure(worn, repeats, least,
         assert min(shares) > share and means[0] <= times * means[1]
 
 
-@pytest.mark.parametrize("rate_hz, repeats, hz, times", [
-    (0, 1, 100.0, 1.4), (0, 1, 120.0, 1.4), (0, 1, 100.1, 1.4), (500, 1, 100.0, 1.5), (250, 1, 120.0, 1.5),
-    (250, 4, 120.0, 1.2), (250, 4, 100.0, 1.2), (100, 1, 101.0, 1.5), (100, 4, 100.3, 1.5),
-    (60, 1, 120.5, 1.5)])
-def test_flicker_and_its_beat_with_the_frame_rate(worn, rate_hz, repeats, hz, times):
-    """50 % deep, of the signal's size, against the same light that does not flicker; rate 0: the full one.
+@pytest.mark.parametrize("rate_hz, repeats, hz", [
+    (0, 1, 100.0), (0, 1, 120.0), (0, 1, 100.1), (500, 1, 100.0), (250, 1, 120.0),
+    (250, 4, 120.0), (250, 4, 100.0), (100, 1, 101.0), (100, 4, 100.3), (60, 1, 120.5)])
+def test_flicker_and_its_beat_with_the_frame_rate(worn, rate_hz, repeats, hz):
+    """50 % deep, of the signal's size, against the same light that does not flicker: 1.2 times the error,
+    over the field.
 
-    One gaze, whose error is mostly noise: as much larger as crests make exposures shorter. What flicker adds
-    to the error anywhere in the field is a figure of tools/bench/bench_frontend.py, flicker_ratio."""
+    rate_hz     0: the full one. At 1000 and 500 Hz with one cycle a frame it is 1.18 to 1.21 times, and up
+                to 15 % of the gazes move faster than an eye and are not VALID: single cycles bear the noise
+                of the interpolation.
+    """
     one = worn()
     one.device.settings(rate_hz=rate_hz, repeats=repeats)
-    one.control.ambient(200.0)
-    one.settle(0.6)
-    seconds = 0.4 if rate_hz == 0 else 1.5
-    steady = one.good(one.run(seconds), "steady", 0.95)
-    exposure_us = np.array(one.device.exposure().exposure_us)
-    one.control.ambient(200.0, 0.5, hz)
-    one.settle(0.6)
-    frames = one.run(seconds)
-    one.never_wild(frames, "flicker")
-    found = one.error(frames)
-    assert not (flags(frames) & lib.SG_FLAG_SATURATED).any()
-    assert np.isfinite(found).mean() > 0.95
-    shorter = np.exp(np.log(exposure_us / one.device.exposure().exposure_us).mean())
-    print(f"{rate_hz or 'full'} Hz, {hz} Hz: {np.nanmean(found):.3f} deg, steady {steady:.3f}, "
-          f"exposures {shorter:.2f} times")
-    assert 1 / 1.1 < shorter < 1.7 and np.nanmean(found) <= times * shorter * steady
+    errors = []
+    for depth in (0.0, 0.5):
+        one.control.ambient(200.0, depth, hz)
+        one.settle(0.6)
+        each = []
+        for place in FIELD:
+            one.look(place)
+            one.settle(0.1 if rate_hz in (0, 250, 500) else 0.6)
+            frames = one.run(0.2 if rate_hz == 0 else 0.5)
+            one.never_wild(frames, f"{depth} deep at {place}")
+            assert not (flags(frames) & lib.SG_FLAG_SATURATED).any()
+            found = one.error(frames)
+            each.append((np.nanmean(found), np.isfinite(found).mean()))
+        error, share = np.mean(each, axis=0)
+        errors.append(error)
+        print(np.round(each, 2).tolist())
+        assert share >= (0.95 if repeats > 1 else 0.8)
+    print(f"{rate_hz or 'full'} Hz, {hz} Hz: {errors[1]:.3f} deg, steady {errors[0]:.3f}")
+    assert errors[1] <= (1.2 if repeats > 1 or rate_hz in (60, 100, 250) else 1.3) * errors[0]
 
 
 # -- exposure ------------------------------------------------------------------------------------------------
