@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures that more than one test folder uses, and a lock on the network."""
 
+import importlib
 import ipaddress
 import os
 import pathlib
 import shutil
 import socket
+import sys
 import tempfile
+import types
 
 import pytest
 
@@ -42,6 +45,25 @@ def firmware_hex():
     path = REPO / "host_sdk" / "sparsegaze" / "data" / "firmware.hex"
     assert path.is_file(), "run make firmware first"
     return path
+
+
+@pytest.fixture(scope="session")
+def bench_modules():
+    """bench_modules(attribute="module of tools/bench", ...) -> these modules under these attributes.
+
+    The folder is on the path only while they are imported.
+    """
+
+    def load(**modules):
+        path = str(REPO / "tools" / "bench")
+        sys.path.insert(0, path)
+        try:
+            loaded = {name: importlib.import_module(module) for name, module in modules.items()}
+        finally:
+            sys.path.remove(path)
+        return types.SimpleNamespace(**loaded)
+
+    return load
 
 
 @pytest.fixture

@@ -4,26 +4,30 @@
 SPARSEGAZE_FUZZ_ROUNDS in the environment lengthens the run (default 20000 rounds per seed)."""
 import os
 import pathlib
-import shutil
 import subprocess
 
 import pytest
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-CORE = ROOT / "firmware" / "core"
+from altered_core import CORE, altered
+
 ROUNDS = os.environ.get("SPARSEGAZE_FUZZ_ROUNDS", "20000")
 FLAGS = ["-std=c11", "-O1", "-g", "-Wall", "-Wextra", "-Werror", "-fsanitize=address,undefined",
          "-fno-sanitize-recover=all", "-fno-omit-frame-pointer"]
 
 
-def build(directory, core=CORE):
-    """Compile the fuzz program; returns its path."""
-    target = directory / "core_fuzz"
-    done = subprocess.run(["gcc", *FLAGS, f"-I{core}", *sorted(core.glob("*.c")),
-                           pathlib.Path(__file__).parent / "core_fuzz.c", "-o", target], capture_output=True,
+def compiled(directory, name, sources):
+    """Compile a fuzz program of this folder with sources of a core; returns its path."""
+    target = directory / name
+    done = subprocess.run(["gcc", *FLAGS, f"-I{sources[0].parent}", *sources,
+                           pathlib.Path(__file__).with_name(f"{name}.c"), "-o", target], capture_output=True,
                           text=True, check=False)
     assert done.returncode == 0, done.stderr
     return target
+
+
+def build(directory, core=CORE):
+    """The program of this file."""
+    return compiled(directory, "core_fuzz", sorted(core.glob("*.c")))
 
 
 def run(program, seed, rounds=ROUNDS):
@@ -63,12 +67,6 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_the_fuzzer_finds_a_planted_fault(fault, tmp_path):
-    name, right, wrong = FAULTS[fault]
-    core = tmp_path / "core"
-    shutil.copytree(CORE, core)
-    text = (core / name).read_text(encoding="utf-8")
-    assert text.count(right) == 1
-    (core / name).write_text(text.replace(right, wrong), encoding="utf-8")
-    code, _, err = run(build(tmp_path, core), 1, "3000")
+    code, _, err = run(build(tmp_path, altered(tmp_path, FAULTS[fault])), 1, "3000")
     assert code != 0 and ("ERROR: AddressSanitizer" in err or "broken invariant" in err
                           or "runtime error" in err)

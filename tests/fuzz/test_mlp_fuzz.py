@@ -4,32 +4,19 @@ sanitizers.
 
 SPARSEGAZE_FUZZ_ROUNDS in the environment, divided by 100, lengthens the run (default 200 rounds a seed)."""
 import os
-import pathlib
-import shutil
-import subprocess
 
 import pytest
 
-from test_core_fuzz import CORE, FLAGS
+from altered_core import CORE, altered
+from test_core_fuzz import compiled, run
 
 ROUNDS = str(int(os.environ.get("SPARSEGAZE_FUZZ_ROUNDS", "20000")) // 100)
 SOURCES = ("sg_mlp.c", "sg_mlp_loop.c", "sg_mlp_table.c", "sg_model.c")
 
 
 def build(directory, core=CORE):
-    """Compile the fuzz program; returns its path."""
-    target = directory / "mlp_fuzz"
-    done = subprocess.run(["gcc", *FLAGS, f"-I{core}", *[core / name for name in SOURCES],
-                           pathlib.Path(__file__).parent / "mlp_fuzz.c", "-o", target], capture_output=True,
-                          text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return target
-
-
-def run(program, seed, rounds=ROUNDS):
-    """(exit code, stdout, stderr)."""
-    done = subprocess.run([program, str(seed), rounds], capture_output=True, text=True, check=False)
-    return done.returncode, done.stdout, done.stderr
+    """The program of this file."""
+    return compiled(directory, "mlp_fuzz", [core / name for name in SOURCES])
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +27,7 @@ def program(tmp_path_factory):
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_changed_networks_are_refused_or_stay_in_bounds(program, seed):
-    code, out, err = run(program, seed)
+    code, out, err = run(program, seed, ROUNDS)
     print(out)
     assert code == 0, err
     words = out.split()
@@ -62,12 +49,6 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_the_fuzzer_finds_a_planted_fault(fault, tmp_path):
-    name, right, wrong = FAULTS[fault]
-    core = tmp_path / "core"
-    shutil.copytree(CORE, core)
-    text = (core / name).read_text(encoding="utf-8")
-    assert text.count(right) == 1
-    (core / name).write_text(text.replace(right, wrong), encoding="utf-8")
-    code, _, err = run(build(tmp_path, core), 1, "40")
+    code, _, err = run(build(tmp_path, altered(tmp_path, FAULTS[fault])), 1, "40")
     assert code != 0 and ("ERROR: AddressSanitizer" in err or "broken invariant" in err
                           or "runtime error" in err)

@@ -30,3 +30,13 @@ def six(sigma_deg=10.0, lens_radius_mm=1.5):
 
 
 OFF_DIAGONAL = ~np.eye(6, dtype=bool)
+
+# Of a Person: lids out of the way, for what concerns the eye alone.
+LIDS_AWAY = dict(
+    lid_upper_deg=58.0,
+    lid_lower_deg=-58.0,
+    canthus_deg=80.0,
+    lid_thickness_mm=0.0,
+    lid_upper_follow=0.0,
+    lid_lower_follow=0.0,
+)

@@ -4,31 +4,25 @@ run."""
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from sim_scenes import pair, port
 
-BENCH = Path(__file__).resolve().parents[2] / "tools" / "bench"
-
 
 @pytest.fixture(scope="module")
-def bench():
-    """The benchmark's modules, by name; its folder is on the path while they are imported."""
-    sys.path.insert(0, str(BENCH))
-    try:
-        import bench_cost
-        import bench_errors
-        import bench_peers
-        import bench_sim
-        import error_curve
-        import mitsuba_peer
-        import peer_scene
-    finally:
-        sys.path.remove(str(BENCH))
-    modules = (bench_cost, bench_errors, bench_peers, bench_sim, error_curve, mitsuba_peer, peer_scene)
-    return {module.__name__: module for module in modules}
+def bench(bench_modules):
+    """The benchmark's modules, by name."""
+    names = (
+        "bench_cost",
+        "bench_errors",
+        "bench_peers",
+        "bench_sim",
+        "error_curve",
+        "mitsuba_peer",
+        "peer_scene",
+    )
+    return vars(bench_modules(**{name: name for name in names}))
 
 
 @pytest.fixture(scope="module")

@@ -8,19 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from brute_image import Eye, eye_response, refract
-from sim_scenes import pair, port
+from sim_scenes import LIDS_AWAY, pair, port
 
 from sparsegaze.person import draw_person
 from sparsegaze.scene import Scene, c_person, simulator
 
-NO_LIDS = dict(
-    lid_upper_deg=58.0,
-    lid_lower_deg=-58.0,
-    canthus_deg=80.0,
-    lid_thickness_mm=0.0,
-    lid_upper_follow=0.0,
-    lid_lower_follow=0.0,
-)
 SENSOR = port((14, -8, -28), (2, 1, -11), 8.5, 0.0)
 EMITTER = port((-12, -10, -31), (-1, 0, -11), 9.0, 0.0)
 
@@ -29,7 +21,7 @@ def test_an_image_of_the_eye_gives_the_same_to_a_thousandth():
     error = []
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        person = replace(draw_person(seed), **NO_LIDS)
+        person = replace(draw_person(seed), **LIDS_AWAY)
         gaze, pupil = rng.uniform(-15, 15, 2), rng.uniform(2.5, 6)
         image = np.array(eye_response(person, SENSOR, EMITTER, *gaze, pupil, 360))
         scene = Scene(pair(SENSOR, EMITTER), person)
@@ -41,7 +33,7 @@ def test_an_image_of_the_eye_gives_the_same_to_a_thousandth():
 
 
 def test_the_image_sees_more_pixels_and_comes_closer():
-    person = replace(draw_person(1), **NO_LIDS)
+    person = replace(draw_person(1), **LIDS_AWAY)
     scene = Scene(pair(SENSOR, EMITTER), person)
     ours = scene.smooth(4, -7, 3.3, 1.0, "eye")[0, 0, 0, 0]
     coarse, fine = (

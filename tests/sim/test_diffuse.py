@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from brute_image import eye_response
-from sim_scenes import OFF_DIAGONAL, pair, port, six
+from sim_scenes import LIDS_AWAY, OFF_DIAGONAL, pair, port, six
 
 from sparsegaze.errors import SceneError
 from sparsegaze.headset import Headset
@@ -16,14 +16,6 @@ from sparsegaze.person import Person, draw_person
 from sparsegaze.scene import Scene, c_person, simulator
 
 ROUGH_FACE = {"face": 0.1}  # no test here looks at the skin
-NO_LIDS = dict(
-    lid_upper_deg=58.0,
-    lid_lower_deg=-58.0,
-    canthus_deg=80.0,
-    lid_thickness_mm=0.0,
-    lid_upper_follow=0.0,
-    lid_lower_follow=0.0,
-)
 STATES = [
     (4, -3, 3.1, 1.0),
     (-17, 11, 4.4, 1.0),
@@ -89,7 +81,7 @@ def test_places_that_are_hard_to_see_from(name, sensor_mm, limit):
 
 def test_the_iris_seen_from_one_side_and_lit_from_the_other_is_that_of_an_image():
     """Sensor 42 degrees to one side, gaze 10 to the other: it sees the iris at 52 degrees from the axis."""
-    person = replace(draw_person(3), **NO_LIDS)
+    person = replace(draw_person(3), **LIDS_AWAY)
     sensor = port((25.0, -6.0, -28.0), (1, 0, -11), 9.0, 0.0)
     emitter = port((6.0, -10.0, -34.0), (1, 0, -11), 10.0, 0.0)
     image = eye_response(person, sensor, emitter, -10, 2, 3.3, 300)[1]
@@ -143,7 +135,7 @@ def test_an_eye_a_metre_off_the_origin_is_the_same_eye():
 
 def test_less_light_comes_back_from_a_white_eye_than_was_sent():
     """Twelve sensors spread evenly over the half space in front; all albedos 1, no lids."""
-    white = replace(Person(), **NO_LIDS, albedo_sclera=1.0, albedo_iris=1.0)
+    white = replace(Person(), **LIDS_AWAY, albedo_sclera=1.0, albedo_iris=1.0)
     n, far = 12, 300.0
     k = np.arange(n) + 0.5
     cosine, phi = 1 - k / n * 0.95, k * 2.39996322972865332

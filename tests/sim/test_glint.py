@@ -14,7 +14,7 @@ from brute_image import Eye, transmission, unit
 from glint_quadrature import Glint
 from random_scenes import random_scenes
 from reference import reference_response
-from sim_scenes import OFF_DIAGONAL, pair, port, six
+from sim_scenes import LIDS_AWAY, OFF_DIAGONAL, pair, port, six
 
 from sparsegaze.headset import Headset, load_headset
 from sparsegaze.person import Person, draw_person, nominal_person
@@ -23,15 +23,7 @@ from sparsegaze.scene import Scene, c_person, simulator
 HEADSET = Path(__file__).resolve().parents[2] / "headsets" / "led2gaze.toml"
 # No relief that could hide a port: what is tested here is the eye and the lids.
 FLAT_FACE = dict(brow_mm=0.0, nose_mm=0.0, cheek_mm=0.0)
-WIDE = dict(
-    lid_upper_deg=58.0,
-    lid_lower_deg=-58.0,
-    canthus_deg=80.0,
-    lid_thickness_mm=0.0,
-    lid_upper_follow=0.0,
-    lid_lower_follow=0.0,
-    **FLAT_FACE,
-)
+WIDE = dict(LIDS_AWAY, **FLAT_FACE)
 STRAIGHT = dict(kappa_azimuth_deg=0.0, kappa_elevation_deg=0.0)
 # A sharp limbus: one with a fold. The nominal one has none: its curvature stays positive.
 SHARP = replace(Person(), limbus_blend_mm=0.3, **WIDE)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from reference import reference_states
-from sim_scenes import port
+from sim_scenes import LIDS_AWAY, port
 
 from sparsegaze.errors import SceneError
 from sparsegaze.headset import Headset
@@ -17,18 +17,7 @@ from sparsegaze.scene import Scene
 
 KINDS = ("mirrored", "round", "axis", "tangent", "any")
 # No face, and lids as wide and soft as can be: in grazing views a sharp margin takes higher fineness.
-BARE = dict(
-    brow_mm=0.0,
-    nose_mm=0.0,
-    cheek_mm=0.0,
-    lid_upper_deg=58.0,
-    lid_lower_deg=-58.0,
-    canthus_deg=80.0,
-    lid_thickness_mm=0.0,
-    lid_softness_mm=3.0,
-    lid_upper_follow=0.0,
-    lid_lower_follow=0.0,
-)
+BARE = dict(LIDS_AWAY, lid_softness_mm=3.0, brow_mm=0.0, nose_mm=0.0, cheek_mm=0.0)
 
 
 def hunted(kind, seed):

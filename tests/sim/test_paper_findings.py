@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import find_peaks
-from sim_scenes import port
+from sim_scenes import LIDS_AWAY, port
 
 from sparsegaze.headset import Headset
 from sparsegaze.person import Person
@@ -28,17 +28,7 @@ from sparsegaze.ring import PLACES_MM, glint_sweep, ring_figures, ring_pair, ris
 from sparsegaze.scene import Scene, c_person, simulator
 
 # Lids out of the way and the optical axis along the gaze: what concerns the cornea alone.
-BARE = replace(
-    Person(),
-    lid_upper_deg=58.0,
-    lid_lower_deg=-58.0,
-    canthus_deg=80.0,
-    lid_thickness_mm=0.0,
-    lid_upper_follow=0.0,
-    lid_lower_follow=0.0,
-    kappa_azimuth_deg=0.0,
-    kappa_elevation_deg=0.0,
-)
+BARE = replace(Person(), kappa_azimuth_deg=0.0, kappa_elevation_deg=0.0, **LIDS_AWAY)
 
 BARE_WITH_KAPPA = replace(BARE, kappa_azimuth_deg=5.0, kappa_elevation_deg=-1.0)
 

@@ -6,22 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from sim_scenes import OFF_DIAGONAL, pair, port, six
+from sim_scenes import LIDS_AWAY, OFF_DIAGONAL, pair, port, six
 
 from sparsegaze.headset import Headset
 from sparsegaze.person import Person, draw_person
 from sparsegaze.scene import Scene, c_person, simulator
 
-# Lids out of the way, for what concerns the eye alone.
-WIDE = replace(
-    Person(),
-    lid_upper_deg=58.0,
-    lid_lower_deg=-58.0,
-    canthus_deg=80.0,
-    lid_thickness_mm=0.0,
-    lid_upper_follow=0.0,
-    lid_lower_follow=0.0,
-)
+WIDE = replace(Person(), **LIDS_AWAY)
 # A corneal sphere on the optical axis, looking where the eye looks.
 SPHERE = replace(
     WIDE, cornea_asphericity=0.0, kappa_azimuth_deg=0.0, kappa_elevation_deg=0.0, limbus_blend_mm=0.3

@@ -3,14 +3,11 @@
 keys."""
 
 import json
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-BENCH = Path(__file__).resolve().parents[2] / "tools" / "bench"
 BITS = {
     "method",
     "adc_khz",
@@ -23,29 +20,17 @@ BITS = {
 
 
 @pytest.fixture(scope="module")
-def bench():
-    """The benchmark's modules as attributes; its folder is on the path while they are imported."""
-    sys.path.insert(0, str(BENCH))
-    try:
-        import bench_frontend
-        import frontend_judge
-        import frontend_methods
-        import frontend_node
-        import frontend_patterns
-        import frontend_physics
-        import frontend_picture
-        import frontend_static
-    finally:
-        sys.path.remove(str(BENCH))
-    return SimpleNamespace(
-        run=bench_frontend,
-        judge=frontend_judge,
-        methods=frontend_methods,
-        node=frontend_node,
-        patterns=frontend_patterns,
-        physics=frontend_physics,
-        picture=frontend_picture,
-        static=frontend_static,
+def bench(bench_modules):
+    """The benchmark's modules as attributes."""
+    return bench_modules(
+        run="bench_frontend",
+        judge="frontend_judge",
+        methods="frontend_methods",
+        node="frontend_node",
+        patterns="frontend_patterns",
+        physics="frontend_physics",
+        picture="frontend_picture",
+        static="frontend_static",
     )
 
 

@@ -1,36 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The benchmark of the front end: what it makes of a device's stream, and that every bar can be missed."""
 
-import sys
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
-BENCH = Path(__file__).resolve().parents[2] / "tools" / "bench"
-
 
 @pytest.fixture(scope="module")
-def bench():
-    """The benchmark's modules as attributes; its folder is on the path while they are imported."""
-    sys.path.insert(0, str(BENCH))
-    try:
-        import frontend_board
-        import frontend_bound
-        import frontend_judge
-        import frontend_latency
-        import frontend_measures
-        import frontend_size
-    finally:
-        sys.path.remove(str(BENCH))
-    return SimpleNamespace(
-        board=frontend_board,
-        bound=frontend_bound,
-        latency=frontend_latency,
-        measures=frontend_measures,
-        size=frontend_size,
-        judge=frontend_judge,
+def bench(bench_modules):
+    """The benchmark's modules as attributes."""
+    return bench_modules(
+        board="frontend_board",
+        bound="frontend_bound",
+        latency="frontend_latency",
+        measures="frontend_measures",
+        size="frontend_size",
+        judge="frontend_judge",
     )
 
 

@@ -6,7 +6,6 @@ Neither peers nor simulated persons here: those take minutes.
 
 import json
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +16,6 @@ from sparsegaze.errors import ModelError
 from sparsegaze.model import HEAD_BYTES, RECORD_BYTES
 from sparsegaze.trust import NODE_BYTES
 
-BENCH = Path(__file__).resolve().parents[2] / "tools" / "bench"
 FRONTIER = {
     "dataset",
     "n",
@@ -33,25 +31,15 @@ FRONTIER = {
 
 
 @pytest.fixture(scope="module")
-def bench():
-    """The benchmark's modules as attributes; its folder is on the path while they are imported."""
-    sys.path.insert(0, str(BENCH))
-    try:
-        import bench_inference
-        import inference_data
-        import inference_host
-        import inference_judge
-        import inference_picture
-        import inference_pieces
-    finally:
-        sys.path.remove(str(BENCH))
-    return SimpleNamespace(
-        run=bench_inference,
-        data=inference_data,
-        host=inference_host,
-        judge=inference_judge,
-        picture=inference_picture,
-        pieces=inference_pieces,
+def bench(bench_modules):
+    """The benchmark's modules as attributes."""
+    return bench_modules(
+        run="bench_inference",
+        data="inference_data",
+        host="inference_host",
+        judge="inference_judge",
+        picture="inference_picture",
+        pieces="inference_pieces",
     )
 
 

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 """Negative controls: a copy of the core with a deliberate fault in sg_mlp must change the golden checksum."""
-import importlib.util
-import shutil
 import zlib
 
 import numpy as np
@@ -9,8 +7,9 @@ import pytest
 
 import core_avr_harness as avr
 import mlp_avr_harness as harness
+from altered_core import altered
 from mlp_models import expected_bytes, golden_case
-from sparsegaze import _core_build
+from test_core_negative import build
 from test_mlp import GOLDEN_CRC
 
 FAULTS = {
@@ -28,10 +27,7 @@ FAULTS = {
 
 def golden_crc(core, directory):
     """Checksum of the golden case by an extension built from a copy of the core."""
-    path = _core_build.build(str(directory), str(core))
-    spec = importlib.util.spec_from_file_location("sparsegaze._core", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = build(core, directory)
     ffi, lib = module.ffi, module.lib
     model, features = golden_case()
     view, image = ffi.new("struct sg_mlp_view *"), ffi.from_buffer("uint8_t[]", model.image)
@@ -44,25 +40,13 @@ def golden_crc(core, directory):
     return zlib.crc32(out)
 
 
-@pytest.fixture
-def core_copy(tmp_path):
-    """The core's sources, to be altered."""
-    shutil.copytree(avr.CORE, tmp_path / "core")
-    (tmp_path / "out").mkdir()
-    return tmp_path / "core"
-
-
-def test_an_unaltered_copy_is_green(core_copy):
-    assert golden_crc(core_copy, core_copy.parent / "out") == GOLDEN_CRC
+def test_an_unaltered_copy_is_green(tmp_path):
+    assert golden_crc(altered(tmp_path), tmp_path / "out") == GOLDEN_CRC
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_broken_core_turns_the_golden_network_red(fault, core_copy):
-    name, right, wrong = FAULTS[fault]
-    text = (core_copy / name).read_text(encoding="utf-8")
-    assert text.count(right) == 1
-    (core_copy / name).write_text(text.replace(right, wrong), encoding="utf-8")
-    assert golden_crc(core_copy, core_copy.parent / "out") != GOLDEN_CRC
+def test_a_broken_core_turns_the_golden_network_red(fault, tmp_path):
+    assert golden_crc(altered(tmp_path, FAULTS[fault]), tmp_path / "out") != GOLDEN_CRC
 
 
 ASSEMBLY_FAULTS = {
@@ -76,12 +60,7 @@ ASSEMBLY_FAULTS = {
 
 @pytest.mark.parametrize("fault", ASSEMBLY_FAULTS)
 def test_a_broken_twin_differs_from_the_host(fault, tmp_path, monkeypatch):
-    right, wrong = ASSEMBLY_FAULTS[fault]
-    core = tmp_path / "core"
-    shutil.copytree(avr.CORE, core)
-    text = (core / "sg_mlp_avr.S").read_text(encoding="utf-8")
-    assert text.count(right) == 1
-    (core / "sg_mlp_avr.S").write_text(text.replace(right, wrong), encoding="utf-8")
+    core = altered(tmp_path, ("sg_mlp_avr.S", *ASSEMBLY_FAULTS[fault]))
     monkeypatch.setattr(avr, "CORE", core)
     flags = [flag for flag in avr.AVR_FLAGS if not flag.startswith("-I")]
     monkeypatch.setattr(avr, "AVR_FLAGS", [*flags, f"-I{core}"])
