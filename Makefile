@@ -61,7 +61,8 @@ native: setup build/native/core build/native/sim ## build what runs here: core, 
 	@$(MAKE) -s --no-print-directory -C tools/vheadset
 
 # setup has built the core too, under setuptools' name for it: only one may stay, the other gets stale.
-build/native/core: $(wildcard firmware/core/*.[ch] $(SDK)/_core_b*.[pc]*) firmware/app/app_rate.c .venv/setup-stamp
+build/native/core: $(wildcard firmware/core/*.[ch] $(SDK)/_core_b*.[pc]*) firmware/app/app_rate.c \
+    .venv/setup-stamp
 	@mkdir -p $(dir $@)
 	@$(call quietly,$(PY) $(SDK)/_core_build.py) && rm -f $(SDK)/_core.abi3.so && touch $@
 

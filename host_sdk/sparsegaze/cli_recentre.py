@@ -25,9 +25,9 @@ def recentre(port, n_points, clear, distance_mm, width_mm, windowed, as_json):
     """Put a shifted headset right: look at the centre for two seconds, and the gaze there becomes (0, 0).
 
     With --points 5, say, look at five dots: gaze = g + offset + G g of the model's output g, where G
-    stretches and shears it. Each point is left out in turn to see whether that helps; if it does not, all stays as it
-    was ("applied": "none"). Offset and gain are kept in the device until --clear or the next recentre; one
-    point leaves the gain alone.
+    stretches and shears it. Each point is left out in turn to see whether that helps; if it does not, all
+    stays as it was ("applied": "none"). Offset and gain are kept in the device until --clear or the next
+    recentre; one point leaves the gain alone.
 
     \b
     Example:

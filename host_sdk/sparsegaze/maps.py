@@ -82,7 +82,7 @@ class GazeMap:
     not_modelled: str = NOT_MODELLED
 
     def sensor_maps(self, state=0, part=None):
-        """What each sensor collects with its emitters lit, [sensor, elevation, azimuth]; part: one of parts."""
+        """What each sensor collects with its emitters lit, [sensor, elevation, azimuth]. part: of parts."""
         whole = self.parts[one_of(self.parts, part, "a part", SceneError)] if part else self.response
         values = whole[state]
         return np.where(self.lit[:, :, None, None], values, 0.0).sum(1)
