@@ -134,7 +134,26 @@ def frontend_table(report):
     """The Markdown table of frontend.json: every bar and aim with what was measured on the worst seed."""
     seeds = report["seeds"]
     head = f"simulated persons {seeds[0]} to {seeds[-1]}, the worst of them; * the default setting"
-    return table_of(bar_rows(head, report))
+    return "\n\n".join([table_of(bar_rows(head, report))] + fault_tables(report))
+
+
+def fault_tables(report):
+    """The section faults as a Markdown table, or nothing where it was not run."""
+    if "faults" not in report:
+        return []
+    head = ["what happens to an eye that looks about", "cycles a frame", "times", "named", "after ms (most)",
+            "VALID before, while, after", "VALID and wrong by 5 deg, of 10,000 frames", "worst VALID, deg"]
+    rows = [head]
+    for row in report["faults"]["rows"]:
+        share = ", ".join("-" if row[key] is None else f"{row[key]:.2f}"
+                          for key in ("valid_before", "valid_while", "valid_after"))
+        after = "-" if row["named_ms"] is None else f"{row['named_ms']:.0f} ({row['named_ms_worst']:.0f})"
+        named = "-" if row["named"] is None else str(row["named"])
+        if row["false_alarms"]:
+            named = f"**{row['false_alarms']} false**"
+        rows.append([row["kind"], str(row["repeats"]), str(row["episodes"]), named, after, share,
+                     f"{row['wild_per_10000']:.1f}", f"{row['worst_deg']:.1f}"])
+    return [table_of(rows)]
 
 
 SIM_BEGIN = "<!-- simulator: written by tools/report.py from build/bench/sim.json -->"

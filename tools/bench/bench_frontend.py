@@ -5,8 +5,8 @@
 
 Writes frontend.json and frontend.png into build/bench. `make bench-frontend` calls this. Sections: methods
 (ways to read a photocurrent, by closed form and Monte Carlo), patterns (which LEDs emit while which
-sense), device (the shipped firmware on virtual Nanos, in device time, with simulated persons), safety
-(light on the eye, by the formulae of IEC 62471), size (flash, RAM, stack). A section that is not run keeps
+sense), device (the shipped firmware on virtual Nanos, in device time, with simulated persons), faults
+(the same persons, with what breaks: named, flagged, never a wild gaze), safety (light on the eye, by the formulae of IEC 62471), size (flash, RAM, stack). A section that is not run keeps
 no figure of an earlier run. The worst seed is reported. Maps and calibrations are kept in
 build/bench/frontend as long as what made them has not changed. Exits 1 when a bar is missed, naming it.
 """
@@ -24,7 +24,7 @@ from sparsegaze.calibrate import plain as without_nan
 from sparsegaze.errors import SparsegazeError
 
 ROOT = Path(__file__).resolve().parents[2]
-SECTIONS = ("methods", "patterns", "device", "safety", "size")
+SECTIONS = ("methods", "patterns", "device", "faults", "safety", "size")
 SEEDS = (
     2000,
     2001,
@@ -91,6 +91,7 @@ def run(wanted, options):
     section("methods", lambda say: methods(options.quick, say))
     section("patterns", lambda say: patterns(seeds, say))
     section("device", lambda say: device(seeds, folder, options.quick, say))
+    section("faults", lambda say: faults(seeds, folder, options.quick, say))
     section("safety", lambda say: safety())
     section("size", lambda say: size())
     report["bars"] = frontend_judge.bars(report)
@@ -128,6 +129,13 @@ def device(seeds, folder, quick, say):
     import frontend_run
 
     return frontend_run.measure(seeds, folder, quick, say)
+
+
+def faults(seeds, folder, quick, say):
+    """The section faults: frontend_faults.measure."""
+    import frontend_faults
+
+    return frontend_faults.measure(seeds, folder, quick, say)
 
 
 def safety():

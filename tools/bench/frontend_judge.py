@@ -3,6 +3,7 @@
 
 import sys
 
+from frontend_faults import to_name
 from frontend_size import RAM_BYTES
 
 RATE_HZ, VECTORS_AIM = 1000.0, 64
@@ -20,6 +21,12 @@ LEGEND = """\
   MISSED: a bar, a figure that is demanded, is not reached by the worst person, or was not measured; the exit
           code is 1. One frame of 60,000 is enough: nothing is rounded in its favour.
   short:  an aim, a figure that is wished for, is not reached. * is the default setting."""
+FAULTS = {  # kinds of episodes whose names begin so
+    "an LED, a finger": ("open", "short", "covered", "finger"),
+    "LEDs swapped": ("swapped",),
+    "supply": ("supply",),
+    "blinks, looking about, steps of light": ("blinks", "looking", "ambient"),
+}
 BITS_APART = 0.25  # closed form against Monte Carlo of 500 draws: 5 standard errors
 
 
@@ -81,6 +88,19 @@ def bars(report):
         )
         least("valid frames, flicker, set to 4 cycles a frame", report["valid_flicker_250"], VALID)
         most("flicker_ratio, over steady light, default setting", report["flicker_ratio"], FLICKER, "aim")
+    if "faults" in report:
+        found = report["faults"]["rows"]
+        for group, kinds in FAULTS.items():
+            for repeats, setting in ((1, "default setting"), (4, "4 cycles a frame")):
+                part = [row for row in found if row["repeats"] == repeats and row["kind"].startswith(kinds)]
+                if part:
+                    wild = sum(row["wild"] for row in part)
+                    most(f"faults: wild gazes called VALID, {group}, {setting}", wild, 0)
+        due = [row for row in found if to_name(row["kind"])]
+        share = sum(row["named"] for row in due) / max(1, sum(row["episodes"] for row in due))
+        least("faults: share of those due that status names", share if due else None, 1.0)
+        alarms = [row["false_alarms"] for row in found if row["false_alarms"] is not None]
+        most("faults: false alarms where nothing is broken", sum(alarms) if alarms else None, 0)
     if "irradiance_w_m2" in report:
         for case, value in report["irradiance_w_m2"].items():
             most(f"irradiance_w_m2, {case}", value, IRRADIANCE_W_M2)
