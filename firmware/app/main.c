@@ -11,7 +11,7 @@ enum {
     REPLY_RESERVE = 24,
     // A blink leaves the calibrated range before the lids are where they were: this long after the last frame
     // out of range a gaze may look right and be wrong.
-    RECOVERY_256US = 122,
+    RECOVERY_256US = 176,               // 45 ms
     BLINK_256US = 43,                   // out of range for so long
     DOUBT_256US = 9,                    // after each: lids that close are in range and out of it by turns
     // No eye turns by more than a degree in a millisecond. What moves by that and so much more is noise, such as
