@@ -117,7 +117,7 @@ void app_request(const struct sg_head *head, uint8_t n, uint32_t arrived_us);   
 void app_sense_start(const struct hal_timing *begin);       // and the port
 void app_sense_timing(const struct hal_timing *wanted);     // from soon on
 const struct hal_timing *app_timing(void);                  // in force
-void app_sense_cycle(const struct hal_cycle *cycle);        // exposure and health of one channel, or two
+void app_sense_cycle(const struct hal_cycle *cycle);        // exposure and health of one channel, or two; NULL: none
 void app_sense_step(void);                                  // on with a change of exposures
 uint8_t app_alarm(void);                                    // bits of enum sg_alarm
 uint8_t app_fault(void);                                    // 1: the gaze is not to be trusted

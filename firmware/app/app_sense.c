@@ -166,7 +166,7 @@ SELDOM static void exposures_moved(void)
 
 void app_sense_step(void)
 {
-    if (wished && app_time_for(EXPOSE_US))
+    if (wished && (wished > EXPOSE_CYCLES || app_time_for(EXPOSE_US)))
         exposures_moved();
 }
 
@@ -193,6 +193,8 @@ static void look_at(const struct sg_reading *reading)
 
 void app_sense_cycle(const struct hal_cycle *cycle)
 {
+    if (!cycle)
+        return;
     const struct sg_reading *reading = &cycle->reading;
     const uint8_t health = (++turn & (HEALTH_TURNS - 1)) == 0;
     if (health) {
@@ -219,8 +221,7 @@ void app_sense_cycle(const struct hal_cycle *cycle)
         else if (!wished)
             wished = 1;
     }
-    if (wished && wished++ >= EXPOSE_CYCLES)
-        exposures_moved();
+    wished += wished != 0;
 }
 
 SELDOM int8_t app_probe(uint8_t emitter, uint16_t seq)

@@ -108,8 +108,8 @@ void hal_report(struct sg_status *status);
 // ----------------------------------------------------------------------------------------------------
 // Up-calls: the port calls, the application implements.
 
-// A sensing cycle is complete. Called at most once per hal_poll(), with the newest; borrowed until it
-// returns.
+// A sensing cycle is complete. Called at most once per hal_poll(), with the newest; borrowed until the
+// next hal_poll().
 void app_on_cycle(const struct hal_cycle *cycle);
 
 // One byte arrived; zero_us is when the latest 0x00 arrived.

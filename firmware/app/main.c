@@ -46,6 +46,7 @@ static uint8_t under_way;
 static uint16_t last_us;                // of the last sample
 static uint8_t refused;                 // something came on the line and found no time
 static uint8_t waited;                  // cycles that it has waited
+static const struct hal_cycle *unseen;  // taken up, and exposure and health have not looked at it
 
 // A request, until there is time for it; its body is still where it was decoded.
 static struct {
@@ -168,10 +169,13 @@ static uint8_t acquires(void)
 // Compared with the frame before, as sensed.
 static uint8_t exposures_changed(const struct sg_reading *reading)
 {
-    if (memcmp(previous_exposure, reading->exposure_cycles, sizeof previous_exposure) == 0)
-        return 0;
-    memcpy(previous_exposure, reading->exposure_cycles, sizeof previous_exposure);
-    return SG_FLAG_EXPOSURE;
+    uint8_t changed = 0;
+    for (uint8_t i = 0; i < HAL_CHANNELS; i++) {
+        if (previous_exposure[i] != reading->exposure_cycles[i])
+            changed = SG_FLAG_EXPOSURE;
+        previous_exposure[i] = reading->exposure_cycles[i];
+    }
+    return changed;
 }
 
 NOT_KEPT static void send_raw(struct sg_raw *raw, const struct sg_model_view *model, const struct sg_affine *recentre)
@@ -332,7 +336,7 @@ void app_on_cycle(const struct hal_cycle *cycle)
         else if (last && app.stream)
             app_count(&app.status.tx_dropped);
         if (!first)                     // which has enough to do
-            app_sense_cycle(cycle);
+            unseen = cycle;
     }
     app.settling -= app.settling != 0;
     app_live_cycle(cycle->t_us);
@@ -372,6 +376,8 @@ int main(void)
 {
     start();
     while (hal_poll()) {
+        app_sense_cycle(unseen);        // after the frame: its gaze waits for nothing
+        unseen = NULL;
         answer();
         if (app.infer_fits || (asked.waiting && app_time_for(0)))
             long_work();

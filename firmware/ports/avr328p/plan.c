@@ -187,21 +187,19 @@ static ONCE uint8_t equal(const struct plan *plan, const struct plan *from, uint
     return plan->exposure_cycles[channel] == from->exposure_cycles[channel];
 }
 
-uint8_t plan_write(struct plan *plan, const struct plan *from, const struct hal_timing *timing, uint8_t lights,
-                   uint8_t phase)
+void plan_write(struct plan *plan, const struct plan *from, const struct hal_timing *timing, uint8_t lights,
+                uint8_t phase)
 {
     const uint8_t a = plan_channel(timing->wiring, 2 * phase), b = plan_channel(timing->wiring, 2 * phase + 1);
     uint8_t *const begin = &plan->begin[phase];
     to = plan->event + begin[0];
     word = to;                          // the first event has none before it
-    const uint8_t same = from && equal(plan, from, a) && equal(plan, from, b);
-    if (same) {
+    if (from && equal(plan, from, a) && equal(plan, from, b)) {
         const uint8_t *const other = &from->begin[phase];
         const uint8_t *at = from->event + other[0];
-        uint8_t left = other[1] - other[0];
-        do
-            put(*at++);
-        while (--left);
+        const uint8_t n = other[1] - other[0];
+        memcpy(to, at, n);
+        to += n;
         if (phase == 0) {
             plan->first_mux = from->first_mux;
             plan->event[plan->first_mux] = ADMUX_GROUND;    // the other may ask for the supply just now
@@ -210,5 +208,4 @@ uint8_t plan_write(struct plan *plan, const struct plan *from, const struct hal_
         pair(plan, timing, lights, phase, a, b);
     }
     begin[1] = (uint8_t)(to - plan->event);
-    return same;
 }

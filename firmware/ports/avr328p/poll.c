@@ -54,6 +54,7 @@ static void sleep_if_idle(void)
 
 int hal_poll(void)
 {
+    sense_poll();               // first: an exposure chosen after the frame before waits for no other
     if (sense_take(&cycle)) {
         app_on_cycle(&cycle);
         sense_taken();
@@ -62,7 +63,6 @@ int hal_poll(void)
         alive = sense_alive();
         wdt_reset();            // the engine is alive, and being here proves the loop
     }
-    sense_poll();
     serial_poll();
     store_poll();
     boot_look_at_stack();

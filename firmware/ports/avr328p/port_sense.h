@@ -122,9 +122,9 @@ extern const uint8_t plan_place[2][HAL_CHANNELS];        // in flash
 uint8_t plan_channel(uint8_t wiring, uint8_t place);
 // Limits, and two releases not too near each other.
 void plan_clip(uint16_t exposure_cycles[HAL_CHANNELS], uint8_t wiring, uint16_t slot_cycles);
-// One list, from plan->exposure_cycles, which are clipped, and plan->slot_cycles; in order 0, 1, 2. Returns 1 if it
-// is a copy of that of `from`, a plan that differs in exposures alone, or NULL.
-uint8_t plan_write(struct plan *plan, const struct plan *from, const struct hal_timing *timing, uint8_t lights,
-                   uint8_t phase);
+// One list, from plan->exposure_cycles, which are clipped, and plan->slot_cycles; in order 0, 1, 2. If its exposures
+// are those of `from`, a plan that differs in exposures alone, or NULL, it is copied.
+void plan_write(struct plan *plan, const struct plan *from, const struct hal_timing *timing, uint8_t lights,
+                uint8_t phase);
 
 #endif

@@ -13,7 +13,7 @@
 enum {
     NONE = 255,
     WAIT_AT = 120,                  // compare match of EVENT_WAIT after that of the service before it
-    PLAN_PATIENCE = 3,              // turns
+    PLAN_PATIENCE = 2,              // cycles
     PAUSE_LEAST_SLOTS = 3,
     RESTART_CYCLES = 1500,          // before a frame that begins with another timing
     PAUSE_MOST = 16000000,          // a frame a second, at least
@@ -62,7 +62,7 @@ static uint8_t timing_new, plan_new;        // asked for and not in a plan yet
 static uint8_t plan_hurry;              // bits of enum hurry: all lists at once, nothing waits for time
 // An exposure halves or doubles: the light is another. No list is that of the plan in use.
 enum hurry { HURRY_LIGHT = 1, HURRY_WHOLE = 2 };
-static uint8_t plan_waited;             // turns, for time to write a list
+static uint8_t plan_since;              // sense_done when exposures were asked for, or a list was written
 static uint8_t written;                     // lists of the next plan
 static uint8_t locked_out;
 uint8_t sense_took;                         // cycles taken, low byte
@@ -70,7 +70,7 @@ static uint16_t late_frames;
 static uint32_t frames;
 static uint32_t took_at;                    // by now()
 static uint8_t shown_plan = NONE;           // what the reading's exposures and these are of
-static uint16_t mean_to_last, mean_to_end;
+static uint16_t mean_to_end;                // and half a microsecond
 static uint8_t late_shown;
 static uint16_t cycles_max;
 static uint8_t supply_wraps = 16;           // of TCNT1, when the supply was last asked for: soon at first
@@ -285,6 +285,7 @@ void hal_expose(uint16_t exposure_cycles[HAL_CHANNELS])
             plan_hurry |= HURRY_LIGHT;
     memcpy(exposure, exposure_cycles, sizeof exposure);
     plan_new = 1;
+    plan_since = sense_done;
 }
 
 // All lists anew, at once.
@@ -326,9 +327,8 @@ void hal_set_timing(struct hal_timing *t)
     write_whole();
 }
 
-// One list of the plan that is not in use, and when all are written it is the next. Returns 1 if that took little
-// time.
-SELDOM static uint8_t write_plan(void)
+// One list of the plan that is not in use, and when all are written it is the next.
+SELDOM static void write_plan(void)
 {
     const uint8_t index = !plan_next;
     struct plan *plan = &sense_plan[index];
@@ -337,10 +337,11 @@ SELDOM static uint8_t write_plan(void)
         memcpy(plan->exposure_cycles, exposure, sizeof exposure);
         plan->slot_cycles = slot;
     }
-    const uint8_t copied = plan_write(plan, plan_hurry & HURRY_WHOLE ? NULL : &sense_plan[plan_next], &timing,
-                                      timing.lights && !locked_out, written);
+    plan_write(plan, plan_hurry & HURRY_WHOLE ? NULL : &sense_plan[plan_next], &timing,
+               timing.lights && !locked_out, written);
+    plan_since = sense_done;
     if (++written != 3)
-        return copied;
+        return;
     written = 0;
     plan_hurry = 0;
     if (shown_plan == index)
@@ -356,20 +357,15 @@ SELDOM static uint8_t write_plan(void)
             sense_list_next = plan->event;
         }
     }
-    return 0;
 }
 
-// A list takes about two slots, and may make the next frame wait a little, but not be late. After some turns it
+// A list takes about two slots, and may make the next frame wait a little, but not be late. After some cycles it
 // no longer waits for that.
 static uint8_t time_for_list(void)
 {
     const uint16_t since = ticks_now() - sense_base;
-    if (plan_hurry || ++plan_waited >= PLAN_PATIENCE
-        || (sense_done == sense_took && since < (SLOTS - 1) * sense_slot)) {
-        plan_waited = 0;
-        return 1;
-    }
-    return 0;
+    return plan_hurry || (uint8_t)(sense_done - plan_since) > PLAN_PATIENCE
+        || (sense_done == sense_took && since < (SLOTS - 1) * sense_slot);
 }
 
 void sense_poll(void)
@@ -378,11 +374,13 @@ void sense_poll(void)
         locked_out = 0;
         write_whole();
     }
-    // The other plan is free when neither the running cycle nor the newest complete one follows it.
-    if ((plan_new || written) && sense_current == plan_next && filling()->other->plan == plan_next
-        && time_for_list())
-        while ((write_plan() || plan_hurry) && written) {
-        }
+    // The other plan is free when neither the running cycle nor the newest complete one follows it. A cycle that
+    // has been asked for the supply keeps its plan.
+    if ((plan_new || written) && supply != SUPPLY_ASKED && sense_current == plan_next
+        && filling()->other->plan == plan_next && time_for_list())
+        do
+            write_plan();
+        while (plan_hurry && written);
     try_supply();
 }
 
@@ -439,18 +437,19 @@ static void look_at_supply(uint8_t done, uint16_t held_code)
 }
 
 // What follows from the plan, once for each.
-SELDOM static void show_plan(struct sg_reading *reading, uint8_t index)
+SELDOM static void show_plan(struct hal_cycle *cycle, uint8_t index)
 {
     const struct plan *plan = &sense_plan[index];
     uint16_t sum = 0;
-    memcpy(reading->exposure_cycles, plan->exposure_cycles, sizeof plan->exposure_cycles);
+    memcpy(cycle->reading.exposure_cycles, plan->exposure_cycles, sizeof plan->exposure_cycles);
     for (uint8_t i = 0; i < HAL_CHANNELS; i++)
         sum += plan->exposure_cycles[i];
     // Mean of the mid-exposures: lit are slots 1, 2, 7, 8, 13 and 14, 7.5 on average; sum / 12 as sum * 5461
     // / 2^16.
     sum = (uint16_t)((uint32_t)sum * 5461U >> 16);
     const uint16_t n = plan->slot_cycles;
-    mean_to_last = 9 * n + (n >> 1) + sum;
+    const uint16_t mean_to_last = 9 * n + (n >> 1) + sum + 8;
+    cycle->span_us = mean_to_last >> 4;
     mean_to_end = mean_to_last + n - SAMPLE_CYCLES;
     shown_plan = index;
 }
@@ -482,8 +481,8 @@ uint8_t sense_take(struct hal_cycle *cycle)
 
     // Read without a lock: the interrupt comes back to this one when the other is complete.
     if (from->plan != shown_plan)
-        show_plan(reading, from->plan);
-    struct late *late = &sense_late[from->turn == 0];
+        show_plan(cycle, from->plan);
+    struct late *late = (struct late *)((uint8_t *)&sense_late[1] - from->turn);    // those of the turn before
     if (late->any || late_shown)
         show_late(reading, late);
     const uint8_t *place = timing.wiring == SG_WIRING_LEDS ? plan_place[0] : plan_place[1];
@@ -503,8 +502,7 @@ uint8_t sense_take(struct hal_cycle *cycle)
 
     wraps -= (uint8_t)((uint8_t)wraps - from->wraps);
     const uint16_t low = from->end & 15;
-    cycle->t_us = us_of(wraps, from->end) - ((uint16_t)(mean_to_end - low + 8) >> 4);
-    cycle->span_us = (uint16_t)(mean_to_last + 8) >> 4;
+    cycle->t_us = us_of(wraps, from->end) - ((uint16_t)(mean_to_end - low) >> 4);
     cycle->seq = from->seq;
     cycle->left = from->left;
     frames += (uint16_t)(from->seq - (uint16_t)frames);
