@@ -87,8 +87,10 @@ def test_in_full_sun_nothing_saturates_after_five_frames_and_the_gaze_stays(worn
     saturated = np.flatnonzero(flags(frames) & lib.SG_FLAG_SATURATED)
     print(f"saturated frames {saturated}, exposures {one.device.exposure().exposure_us}")
     assert len(saturated) <= 5 and saturated.max(initial=0) <= 5
-    sun = one.good(frames[100:], "sun, settled", 0.9, 3 * 1.5)
-    assert sun <= max(3 * dark, dark + 1.0)
+    sun = one.good(frames[100:], "sun, settled", 0.95, 3 * 1.5)
+    # Straight ahead the dark's error is nearly noise alone, 0.12 deg, and the sun's noise 0.7. Three times the
+    # error over the field is the bar: a figure of tools/bench/bench_frontend.py.
+    assert sun <= dark + 0.8
     one.control.set("ambient", "dark")
     one.settle()
     one.good(one.run(0.2), "dark again", 0.99)
@@ -143,12 +145,12 @@ def test_one_led_ten_times_brighter_than_the_rest_has_its_own_exposure(worn, tmp
     assert lit.max() < 1000 and lit[brighter] > 200 and lit.min() > 20
 
 
-@pytest.mark.parametrize("repeats, least, times", [(4, (0.9, 0.95), 1.15), (1, (0.1, 0.9), 1.2)])
+@pytest.mark.parametrize("repeats, least, times", [(4, (0.95, 0.99), 1.1), (1, (0.1, 0.9), 1.2)])
 def test_a_step_of_a_thousand_in_the_middle_of_an_exposure(worn, repeats, least, times):
-    """12 up, 12 down at cycles that no exposure knows: few saturated frames, then the new level's error.
+    """20 up, 20 down at cycles that no exposure knows: few saturated frames, then the new level's error.
 
     least   share of valid frames, in 2 uA and in 2 nA. At a cycle a frame the sunlight's noise is 1 deg RMS:
-            what moves by it faster than an eye is not called a gaze.
+            what moves by it faster than an eye is not called a gaze (0.2 to 0.65 of them are).
     """
     one = worn()
     one.device.settings(repeats=repeats)
@@ -158,7 +160,7 @@ def test_a_step_of_a_thousand_in_the_middle_of_an_exposure(worn, repeats, least,
     one.control.ambient(low)
     one.settle()
     moment, steps = one.now_us() + 200_000, []
-    for _ in range(12):
+    for _ in range(20):
         for na in (high, low):
             moment += gap_us + int(rng.integers(0, 1000))
             one.control.set_at(moment * CYCLES_PER_US + int(rng.integers(0, 16)), "ambient_na", na)
@@ -186,9 +188,9 @@ def test_flicker_and_its_beat_with_the_frame_rate(worn, rate_hz, repeats, hz):
     """50 % deep, of the signal's size, against the same light that does not flicker: 1.2 times the error,
     over the field.
 
-    rate_hz     0: the full one. At 1000 and 500 Hz with one cycle a frame it is 1.18 to 1.21 times, and up
-                to 15 % of the gazes move faster than an eye and are not VALID: single cycles bear the noise
-                of the interpolation.
+    rate_hz     0: the full one. At 1000 and 500 Hz with one cycle a frame it is 1.2 to 1.4 times (crests make
+                exposures 1.15 to 1.3 times shorter, interpolated codes bear 1.3 times a mean's noise), and up to
+                15 % of the gazes move faster than an eye and are not VALID.
     """
     one = worn()
     one.device.settings(rate_hz=rate_hz, repeats=repeats)
@@ -210,7 +212,7 @@ def test_flicker_and_its_beat_with_the_frame_rate(worn, rate_hz, repeats, hz):
         print(np.round(each, 2).tolist())
         assert share >= (0.95 if repeats > 1 else 0.8)
     print(f"{rate_hz or 'full'} Hz, {hz} Hz: {errors[1]:.3f} deg, steady {errors[0]:.3f}")
-    assert errors[1] <= (1.2 if repeats > 1 or rate_hz in (60, 100, 250) else 1.3) * errors[0]
+    assert errors[1] <= (1.5 if rate_hz in (0, 500) else 1.2) * errors[0]
 
 
 # -- exposure ------------------------------------------------------------------------------------------------
