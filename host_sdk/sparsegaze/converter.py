@@ -13,12 +13,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import erfc
 
-ZEROS = np.arange(-8.0, 6.1, 0.25)  # codes; the device knows none above 0, where unlit codes tell all
+ZEROS = np.arange(-8.0, 6.1, 0.25)  # codes, tried first; the device knows none above 0: unlit codes tell all
+FINER = np.arange(-5, 6) * 0.05  # about the best of these
 CODE_MOST = 40.0  # above, curvature and non-linearity bend the line by more than noise does
 NOISE_CODES = 0.755  # of one conversion at 250 kHz, as in firmware/core/make_tables.py
 SOME_CODES, BENT_SHARE = 0.05, 0.004  # of a mean, beside its noise: non-linearity, curvature
 RATES = np.concatenate([[0.0], np.geomspace(1e-3, 16.0, 40)])  # codes a microsecond, tried first
 REFINE = np.linspace(0.0, 1.0, 33)
+SHARE = 0.318  # of the sample capacitor in a node: what a pair's second keeps of its first
 PLAIN_CODES = 1.5  # a mean above is its level
 DEVICE_PLAIN = 1.25  # a mean above which the device takes for its level
 DEVICE_LEAST = -1.56  # what it takes a mean of 0 for, if its zero is below
@@ -44,22 +46,39 @@ def rectified(level):
 _MEANS = rectified(LEVELS)
 
 
-def unlit(exposure_us, mean, frames):
-    """Unlit of mean unlit codes [n, 6] in exposures [n, 6], each of frames [n] frames."""
-    cost, rate = np.zeros(len(ZEROS)), np.zeros((len(ZEROS), mean.shape[1]))
-    for i in range(mean.shape[1]):
-        use = mean[:, i] < CODE_MOST
-        if not use.any():
-            rate[:, i] = np.inf
+def levels(zero, rate, exposure_us, before):
+    """Unlit codes [n, 6] if codes went below 0: rate [6] codes a microsecond and what a pair's first brings.
+
+    before   [6] channel sampled right before each, -1: none
+    """
+    own = rate * exposure_us
+    return zero + own + np.where(before >= 0, SHARE * own[:, np.maximum(before, 0)], 0.0)
+
+
+def unlit(exposure_us, mean, frames, before, zeros=ZEROS):
+    """Unlit of mean unlit codes [n, 6] in exposures [n, 6], each of frames [n] frames, for these zeros.
+
+    A rate is inf where codes are too many to tell a zero.
+    """
+    cost, rate = np.zeros(len(zeros)), np.full((len(zeros), mean.shape[1]), np.inf)
+    rows, frames = np.arange(len(zeros)), np.asarray(frames, float)
+    for i in np.argsort(before):  # a pair's first before its second
+        use, first = mean[:, i] < CODE_MOST, before[i]
+        if not use.any() or (first >= 0 and np.isinf(rate[0, first])):
             continue
-        t, m, n = exposure_us[use, i], mean[use, i], np.asarray(frames, float)[use]
-        at, where = np.unique(np.round(16 * t), return_inverse=True)
-        n_at = np.bincount(where, n)
-        m_at = np.bincount(where, n * m) / n_at
+        t, m, n = exposure_us[use, i], mean[use, i], frames[use]
+        with_t = t if first < 0 else np.stack([t, exposure_us[use, first]], axis=1)
+        _, where = np.unique(np.round(16 * with_t), axis=0, return_inverse=True)
+        n_at = np.bincount(where.ravel(), n)
+        m_at, t_at = (np.bincount(where.ravel(), n * value) / n_at for value in (m, t))
+        start = zeros[:, None]
+        if first >= 0:
+            first_at = np.bincount(where.ravel(), n * exposure_us[use, first]) / n_at
+            start = start + SHARE * rate[:, first, None] * first_at
         deviation2 = NOISE_CODES**2 / n_at + SOME_CODES**2 + (BENT_SHARE * m_at) ** 2
-        tried, rows = np.tile(RATES, (len(ZEROS), 1)), np.arange(len(ZEROS))
+        tried = np.tile(RATES, (len(zeros), 1))
         for finer in (REFINE, REFINE, None):
-            level = ZEROS[:, None, None] + tried[:, :, None] * (at / 16)
+            level = start[:, None] + tried[:, :, None] * t_at
             made = np.where(level > PLAIN_CODES, level, np.interp(level, LEVELS, _MEANS))
             each = ((made - m_at) ** 2 / deviation2).sum(axis=2)
             best = each.argmin(axis=1)

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from . import converter
+from .converter import SHARE
 from .errors import CalibrationError
 
 CHANNELS = 6
@@ -28,7 +29,6 @@ CURVE_SD = 0.03  # of parts, as far as they are known: curves that the data do n
 ZERO_SD = 2.0  # codes, likewise
 STATIC_OCTAVES = 0.0015  # of a level, by the converter's non-linearity
 NOMINAL = 0.05  # the curve that the firmware takes off for every part, to first order
-SHARE = 0.318  # of the sample capacitor in a node: what a pair's second keeps of its first
 ALONE = (-1,) * CHANNELS
 
 
@@ -76,10 +76,11 @@ def fit(holds, curve, zero_codes, dark=(), before=ALONE, wanted=None):
     Raises CalibrationError when too few of the exposures are usable.
     """
     pair = _Pair(holds, np.asarray(curve, float), zero_codes, dark, np.asarray(before))
-    zero = min(range(len(converter.ZEROS)), key=pair.cost)
+    pair.try_zeros(pair.zeros[min(range(len(pair.zeros)), key=pair.cost)] + converter.FINER)
+    zero = min(range(len(pair.zeros)), key=pair.cost)
     found = [pair.solve(i, zero)[0] for i in range(CHANNELS)]
     steps = np.clip(np.round(1024 * np.array(found)), -CURVE_STEPS, CURVE_STEPS) / 1024
-    zero_codes = min(float(converter.ZEROS[zero]), 0.0)
+    zero_codes = min(round(4 * pair.zeros[zero]) / 4, 0.0)  # as the device keeps it
     shift, noise = pair.quarter(pair.d)
     left, _ = pair.quarter(pair.with_others(zero, *(wanted or (steps, zero_codes))))
     return Fit(steps, zero_codes, shift, noise, len(pair.d), pair.given, left)
@@ -91,11 +92,11 @@ class _Side:
     def __init__(self, lit, unlit, exposure_us, before):
         self.lit, self.unlit, self.exposure_us = lit, unlit, exposure_us
         self.x = (lit + unlit) / 1024
-        self.first, self.second = np.maximum(before, 0), before >= 0
+        self.before, self.first, self.second = before, np.maximum(before, 0), before >= 0
 
     def levels(self, zero, rate):
         """Unlit codes as they would be if codes went below 0."""
-        made = zero + rate * self.exposure_us
+        made = converter.levels(zero, rate, self.exposure_us, self.before)
         return np.where(made < converter.PLAIN_CODES, np.minimum(made, self.unlit + 1.0), self.unlit)
 
     def charge(self, i, levels, curve):
@@ -133,20 +134,26 @@ class _Pair:
         self.rung = np.unique(np.round(np.median(self.ratio, axis=1), 2), return_inverse=True)[1]
         self.old, self.zero = curve, zero
         every = [*holds, *dark]
-        self.unlit = converter.unlit(
+        self.seen = (
             np.array([hold.exposure_us for hold in every]),
             np.array([hold.unlit for hold in every]),
             [hold.frames for hold in every],
+            before,
         )
+        self.try_zeros(converter.ZEROS)
         self.reads = {}
         self.spread = np.ones(CHANNELS)
         start = int(self.unlit.cost.argmin())
         rest = [self.solve(i, start)[1] for i in range(CHANNELS)]
         self.spread = np.array([max(1.4826 * np.median(np.abs(r - np.median(r))), 1e-5) for r in rest])
 
+    def try_zeros(self, zeros):
+        """Zeros that indices mean from now on."""
+        self.zeros, self.unlit = zeros, converter.unlit(*self.seen, zeros)
+
     def levels(self, zero):
-        """[2] of unlit levels [n, 6], short and long, if the true zero is ZEROS[zero]."""
-        return [side.levels(converter.ZEROS[zero], self.unlit.rate[zero]) for side in self.sides]
+        """[2] of unlit levels [n, 6], short and long, if the true zero is zeros[zero]."""
+        return [side.levels(self.zeros[zero], self.unlit.rate[zero]) for side in self.sides]
 
     def taken(self, levels, zero_codes):
         """What the device takes levels for with zero_codes in force."""
@@ -166,7 +173,7 @@ class _Pair:
         return np.log2(short[0] / long[0]), slope
 
     def solve(self, i, zero):
-        """(curve, what it leaves [n]) of one channel for ZEROS[zero]; outliers weigh less."""
+        """(curve, what it leaves [n]) of one channel for zeros[zero]; outliers weigh less."""
         d = self.d[:, i] - self.made(i, zero, self.old[i], self.zero)
         levels, c, offset = self.levels(zero), self.old[i], 0.0
         whole = len(d) / (self.rung.max() + 1) / self.spread[i] ** 2  # the long exposures are a rung too
@@ -185,8 +192,8 @@ class _Pair:
         return c, d + self._octaves(i, levels, c)[0]
 
     def cost(self, zero):
-        """Misfit of ZEROS[zero] and the best curves, in deviations squared."""
-        total = self.unlit.cost[zero] + ((min(converter.ZEROS[zero], 0.0) - self.zero) / ZERO_SD) ** 2
+        """Misfit of zeros[zero] and the best curves, in deviations squared."""
+        total = self.unlit.cost[zero] + ((min(self.zeros[zero], 0.0) - self.zero) / ZERO_SD) ** 2
         if total > self.unlit.cost.min() + 100:
             return total
         for i in range(CHANNELS):
@@ -194,11 +201,12 @@ class _Pair:
             total += (curve / CURVE_SD) ** 2
             for k in range(self.rung.max() + 1):
                 rows = rest[self.rung == k]
-                total += np.median(rows) ** 2 / (STATIC_OCTAVES**2 + 1.57 * self.spread[i] ** 2 / len(rows))
+                deviation2 = STATIC_OCTAVES**2 + 1.57 * self.spread[i] ** 2 / len(rows)
+                total += np.median(rows) ** 2 / deviation2 / CHANNELS  # one converter: they err alike
         return float(total)
 
     def with_others(self, zero, curve, zero_codes):
-        """d [n, 6] as another curve [6] and zero in force would have made it; ZEROS[zero] is the true one."""
+        """d [n, 6] as another curve [6] and zero in force would have made it; zeros[zero] is the true one."""
         change = [
             self.made(i, zero, curve[i], zero_codes) - self.made(i, zero, self.old[i], self.zero)
             for i in range(CHANNELS)

@@ -88,9 +88,10 @@ def board(virtual_nano, firmware_elf, any_map, tmp_path):
     def start(models=None, **options):
         options.setdefault("app", firmware_elf)
         options.setdefault("state_dir", tmp_path / "state")
+        options.setdefault("person", 1)
         if models is not None:
             put_models(options["state_dir"], models)
-        nano = virtual_nano(map=any_map, unpaced=True, person=1, **options)
+        nano = virtual_nano(map=any_map, unpaced=True, **options)
         device = Device(nano.port)
         devices.append(device)
         return nano, device

@@ -146,18 +146,22 @@ def test_what_another_curve_would_leave_is_what_it_leaves():
 @pytest.mark.parametrize("zero", [-3.0, -2.0, -1.0, 0.0, 1.5])
 def test_a_zero_is_found_from_unlit_codes_alone(zero):
     rng = np.random.default_rng(2)
-    t = np.array([159, 95, 56, 32])[:, None] * np.ones(6)
+    apart = [[90, 40, 50, 70, 30, 80], [40, 90, 50, 30, 80, 70]]  # a second's follow its own and its first's
+    t = np.concatenate([np.full((2, 6), [[159.0], [56.0]]), apart])
     rate = 0.02 * np.array(LEAKY)
     level = zero + rate * t
+    for first, second in PAIRS[lib.SG_WIRING_LEDS]:
+        level[:, second] += 14 / 44 * rate[first] * t[:, first]
     codes = np.maximum(np.floor(level + rng.normal(0, NOISE_LSB, (160, 4, 6)) + 0.5), 0)
-    told = converter.unlit(t, codes.mean(axis=0), np.full(4, 160))
+    told = converter.unlit(t, codes.mean(axis=0), np.full(4, 160), np.array(BEFORE))
     found = int(told.cost.argmin())
     assert converter.ZEROS[found] == pytest.approx(zero, abs=0.26)
     assert told.rate[found][[0, 4, 5]] == pytest.approx(rate[[0, 4, 5]], rel=0.15)
 
 
 def test_unlit_codes_that_never_come_up_from_0_tell_only_that():
-    told = converter.unlit(np.full((3, 6), [[159.0], [90.0], [40.0]]), np.zeros((3, 6)), np.full(3, 160))
+    t = np.full((3, 6), [[159.0], [90.0], [40.0]])
+    told = converter.unlit(t, np.zeros((3, 6)), np.full(3, 160), np.array(BEFORE))
     deep = converter.ZEROS <= -1.5
     assert np.ptp(told.cost[deep]) < 1.0 and told.cost[converter.ZEROS >= 0].min() > 100
 
