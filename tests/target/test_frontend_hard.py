@@ -88,8 +88,8 @@ def test_in_full_sun_nothing_saturates_after_five_frames_and_the_gaze_stays(worn
     print(f"saturated frames {saturated}, exposures {one.device.exposure().exposure_us}")
     assert len(saturated) <= 5 and saturated.max(initial=0) <= 5
     sun = one.good(frames[100:], "sun, settled", 0.95, 3 * 1.5)
-    # Straight ahead the dark's error is nearly noise alone, 0.12 deg, and the sun's noise 0.7. Three times the
-    # error over the field is the bar: a figure of tools/bench/bench_frontend.py.
+    # Straight ahead the dark's error is nearly noise alone, 0.12 deg, and the sun's noise 0.7. Three times
+    # the error over the field is the bar: a figure of tools/bench/bench_frontend.py.
     assert sun <= dark + 0.8
     one.control.set("ambient", "dark")
     one.settle()
@@ -189,8 +189,8 @@ def test_flicker_and_its_beat_with_the_frame_rate(worn, rate_hz, repeats, hz):
     over the field.
 
     rate_hz     0: the full one. At 1000 and 500 Hz with one cycle a frame it is 1.2 to 1.4 times (crests make
-                exposures 1.15 to 1.3 times shorter, interpolated codes bear 1.3 times a mean's noise), and up to
-                15 % of the gazes move faster than an eye and are not VALID.
+                exposures 1.15 to 1.3 times shorter, interpolated codes bear 1.3 times a mean's noise), and
+                up to 15 % of the gazes move faster than an eye and are not VALID.
     """
     one = worn()
     one.device.settings(rate_hz=rate_hz, repeats=repeats)
