@@ -108,8 +108,9 @@ def bars(report):
     if "flash" in report:
         flash = report["flash"]
         least("flash to spare, share, beside Optiboot's 512 B", flash["spare"], SPARE)
-        old = flash["spare_old_loader"]
-        least("flash to spare, share, beside the older loader's 2 KiB", old, SPARE, "aim")
+        if "spare_old_loader" in flash:  # not in reports of before
+            old = flash["spare_old_loader"]
+            least("flash to spare, share, beside the older loader's 2 KiB", old, SPARE, "aim")
     if "stack_free" in report:
         least("RAM never touched, share", report["stack_free"] / RAM_BYTES, SPARE)
     return rows
