@@ -11,6 +11,7 @@ enum {
     UNLIKE_LOOKS = 4,
     EXPOSE_US = 140,            // asking for exposures
     EXPOSE_CYCLES = 3,          // and if there is no time for it within so many cycles, it is done anyway
+    COMING_CYCLES = 5,          // until a reading has them, mostly
     HEALTH_TURNS = 8,           // cycles from one look at the health of a channel to the next channel's; 2^n
     // Cycles of a probe, counted down: until the emitter is alone, its readings, until all is as before.
     PROBE_BEFORE = 4,
@@ -20,6 +21,7 @@ enum {
 };
 
 static uint8_t wished;                  // cycles since exposures were chosen that are not asked for yet; 0: none
+static uint8_t coming;                  // cycles until a reading has what was asked for: looks say little then
 static uint8_t unlike;                  // looks in a row at exposures that are not those asked for
 
 // The channel sampled right before each, per wiring (firmware/core/sg_light.h); 255: none.
@@ -160,6 +162,7 @@ SELDOM uint8_t app_exposures_far(const uint16_t cycles[HAL_CHANNELS], uint8_t sh
 SELDOM static void exposures_moved(void)
 {
     wished = 0;
+    coming = COMING_CYCLES;
     expose();
     app_count(&app.status.exposure_changes);
 }
@@ -168,6 +171,13 @@ void app_sense_step(void)
 {
     if (wished && (wished > EXPOSE_CYCLES || app_time_for(EXPOSE_US)))
         exposures_moved();
+}
+
+// Lids, not light, which waits for nothing: a look takes longest when sensors are full.
+static uint8_t can_wait(const struct sg_reading *reading)
+{
+    return coming && !app.expose.acquiring
+           && !((uint16_t)(reading->unlit_code[0] | reading->unlit_code[3] | reading->unlit_code[5]) >> 8);
 }
 
 static uint8_t first(uint8_t i)
@@ -214,14 +224,16 @@ void app_sense_cycle(const struct hal_cycle *cycle)
     // One or the other: what a cycle takes at most counts.
     if (health)
         look_at(reading);
-    else if (app.exposure_auto && sg_expose_cycle(&app.expose, reading, timing.wiring)) {
-        // A quarter waits for nothing.
+    else if (app.exposure_auto && !can_wait(reading)
+             && sg_expose_cycle(&app.expose, reading, timing.wiring)) {
+        // A quarter waits for a cycle at most.
         if (app_exposures_far(reading->exposure_cycles, 2))
-            wished = EXPOSE_CYCLES;
+            wished = app.expose.acquiring ? EXPOSE_CYCLES : EXPOSE_CYCLES - 1;
         else if (!wished)
             wished = 1;
     }
     wished += wished != 0;
+    coming -= coming != 0;
 }
 
 SELDOM int8_t app_probe(uint8_t emitter, uint16_t seq)
