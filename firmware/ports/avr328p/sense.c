@@ -419,7 +419,8 @@ SELDOM void sense_start(struct hal_timing *t, uint16_t exposure_cycles[HAL_CHANN
 
 // ------------------------------------------------------------------------------------------------------
 
-static void look_at_supply(uint8_t done, uint16_t held_code)
+// Where the cycle's last channel is full, the sample capacitor brings its volts along: that reading says nothing.
+static void look_at_supply(uint8_t done, uint16_t held_code, uint16_t last_code)
 {
     const uint8_t now_wraps = (uint8_t)sense_wraps;
     if ((uint8_t)(now_wraps - supply_wraps) >= SUPPLY_EVERY_WRAPS) {
@@ -429,6 +430,8 @@ static void look_at_supply(uint8_t done, uint16_t held_code)
     if (supply != SUPPLY_ASKED || done != supply_of)
         return;
     supply = SUPPLY_RESTS;
+    if (last_code >= SG_LIGHT_SATURATED_CODE)
+        return;
     supply_code = 0;
     if (held_code >= SUPPLY_CODE_LEAST && held_code <= SUPPLY_CODE_MOST)
         supply_code = (uint8_t)held_code;
@@ -498,7 +501,7 @@ uint8_t sense_take(struct hal_cycle *cycle)
         to_b[UNLIT_AFTER] = *code++;
     }
     reading->held_code = from->code[0] < HELD_LEAST ? 0 : from->code[0];
-    look_at_supply(done, reading->held_code);
+    look_at_supply(done, reading->held_code, code[-1]);
 
     wraps -= (uint8_t)((uint8_t)wraps - from->wraps);
     const uint16_t low = from->end & 15;
