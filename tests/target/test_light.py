@@ -263,9 +263,10 @@ def test_exposures_do_not_hunt(board):
     nano.control.ambient(200.0, 0.5, 100)
     assert (flags_of(frames_of(device, 100)) & lib.SG_FLAG_EXPOSURE).any()
     still(nano, device, 1.0)
-    changes = (flags_of(frames_of(device, 1000)) & lib.SG_FLAG_EXPOSURE != 0).sum()
+    # A stream that begins has exposures found anew: 5 in its first 51 frames were seen, then 1 in 950.
+    changes = (flags_of(frames_of(device, 1000, settle_s=0.1)) & lib.SG_FLAG_EXPOSURE != 0).sum()
     print(f"{changes} in flicker")
-    assert changes <= 4
+    assert changes <= 2
 
 
 @pytest.mark.parametrize("gap_us", [3000, 5000, 7000])
