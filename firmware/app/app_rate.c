@@ -169,7 +169,7 @@ uint16_t app_frame_us(void)
 {
     const struct hal_timing *timing = app_timing();
     if (!timing->frame_cycles)
-        return times(us_of(timing->period_cycles), timing->repeats);
+        return (uint16_t)((uint32_t)timing->period_cycles * timing->repeats / CYCLES_PER_US);
     return (uint16_t)(timing->frame_cycles / CYCLES_PER_US);
 }
 

@@ -178,8 +178,15 @@ static uint8_t look(const struct sg_expose *expose, struct sg_expose_led *led, u
     // What ambient light did, with the signal as it was when the exposure was chosen: gaze has no part in it.
     const uint8_t risen = load_then_q2 > BRIGHT_Q2 && above(led->unlit_peak, led->unlit_then, RISEN_Q2);
     const uint8_t freed = longer && above(led->unlit_then, led->unlit_peak, FREED_Q2);
-    if (risen || freed)
+    if (risen)
         return choose(led, led->signal_then);
+    if (freed) {
+        // The peak is still on its way down, and says too much.
+        led->stage = SG_EXPOSE_WATCH;
+        led->streak = 0;
+        led->unlit_peak = 0;
+        return 0;
+    }
     // What our own light did must last.
     if (bright)
         led->streak = (int8_t)(led->streak > 0 ? led->streak + 1 : 1);

@@ -28,8 +28,7 @@ enum sg_expose_limits {
 enum sg_expose_patience {               // looks at a channel: one in six cycles
     SG_EXPOSE_PATIENCE_BRIGHT = 5,      // 31 ms at 1 kHz
     SG_EXPOSE_PATIENCE_DIM = 120,       // 0.7 s: longer than a blink
-    SG_EXPOSE_PATIENCE_LOOKS = 256,     // 1.5 s
-    SG_EXPOSE_PATIENCE_TIMES = 5,       // as long as these: longer than from blink to blink
+    SG_EXPOSE_PATIENCE_TIMES = 5,       // as long as these times 256 looks, 1.5 s: longer than from blink to blink
 };
 
 // Exposure from the wire's sixteenths of a microsecond (they are timer cycles), clipped to the limits.
@@ -62,7 +61,7 @@ struct sg_expose {
     uint8_t acquiring;          // 1: some may be
     uint8_t fallen;             // looks in a row that found an unlit code below 1/16 of its peak
     uint8_t next;               // channel to look at
-    uint8_t rounds;             // of looks, mod SG_EXPOSE_PATIENCE_ROUNDS
+    uint8_t rounds;             // of looks, mod 256
     uint8_t times;              // that they were full, mod SG_EXPOSE_PATIENCE_TIMES
     uint8_t drowned;            // 1: a channel of this cycle is full without our light
 };

@@ -176,6 +176,7 @@ def good_report():
         "valid_250": dict.fromkeys(names, 0.9),
         "saturated_after": dict.fromkeys(names, 0),
         "saturated_after_250": dict.fromkeys(names, 0),
+        **{f"{key}_in{table}": dict.fromkeys(names, 0) for key in ("late", "lost") for table in ("", "_250")},
         "step_250": {"saturated_frames": 2, "settle_frames": 6},
         "step": {"saturated_frames": 2, "settle_frames": 6},
         "exposure_shift_over_s2s": 0.4,
@@ -250,6 +251,16 @@ def test_a_missed_bar_is_named_and_the_exit_code_is_one(bench, tmp_path, capsys)
     said = capsys.readouterr()
     assert "bar missed: * rate_hz" in said.err
     assert "MISSED: a bar, a figure that is demanded" in said.out and "short:  an aim" in said.out
+
+
+@pytest.mark.parametrize(
+    "key, words", [("late_in", "share of frames late, sun_gap"), ("lost_in", "lost frames of a second")]
+)
+def test_late_and_lost_frames_in_the_sun_are_aims_that_can_be_short(bench, key, words):
+    report = good_report()
+    report[key] = {**report[key], "sun_gap": 1}
+    missed = [bar for bar in bench.judge.bars(report) if not bar["met"] and bar["name"] != "* n_vectors"]
+    assert len(missed) == 1 and missed[0]["name"].startswith(words) and missed[0]["kind"] == "aim"
 
 
 def test_the_older_loader_s_share_is_an_aim_that_can_be_short(bench):

@@ -13,6 +13,7 @@ S2S_DEG, S2S_250_DEG = 0.35, 0.18
 RATIO = {"room": 1.1, "bright_room": 1.5, "sun_gap": 3.0}
 STEP_SATURATED, STEP_SETTLE = 5, 10
 # of report keys, in words, and whether the bar is judged at it
+LATE = 0.01  # of frames, in ambient light
 SETTINGS = (("_250", "4 cycles a frame", "bar"), ("", "default setting", "aim"))
 VALID, VALID_NOMINAL = 0.8, 0.95  # what is left out may not be what is wrong
 PLACES = 25  # of the grid
@@ -76,6 +77,9 @@ def bars(report):
             for key, setting, kind in SETTINGS:
                 saturated = report["saturated_after" + key][name]
                 most(f"saturated frames after the first 5, {name}, {setting}", saturated, 0, kind)
+                if "late_in" in report:  # not in reports of before
+                    most(f"share of frames late, {name}, {setting}", report["late_in" + key][name], LATE, "aim")
+                    most(f"lost frames of a second, {name}, {setting}", report["lost_in" + key][name], 0, "aim")
         for key, setting, kind in SETTINGS:
             step = report["step" + key]
             most(f"step.saturated_frames, {setting}", step["saturated_frames"], STEP_SATURATED, kind)

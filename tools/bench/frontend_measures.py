@@ -59,8 +59,8 @@ def judge_grid(frames, target, index):
 
 
 def ambient(board, name, repeats=1):
-    """precision() in an ambient light of physics.toml, and how many frames after its coming were
-    saturated."""
+    """precision() in an ambient light of physics.toml, how many frames after its coming were saturated, and
+    how many of a second were lost and which share late."""
     board.device.settings(repeats=repeats)
     rest(board)
     board.control.set("ambient", name)
@@ -68,6 +68,12 @@ def ambient(board, name, repeats=1):
     found = precision(board)
     found["saturated_after"] = saturated_after(came)
     found["rate_hz"] = rate_of(came)
+    before = board.device.status()
+    steady = board.frames(1.0)
+    after = board.device.status()
+    found["lost"] = int(steady["seq"][-1] - steady["seq"][0]) + 1 - len(steady)
+    # A STATUS makes a few late itself: a share of those few is none.
+    found["late"] = ((after.late_frames - before.late_frames) & 0xFFFF) / ((after.frames - before.frames) & 0xFFFF)
     rest(board)
     board.device.settings(repeats=1)
     return found

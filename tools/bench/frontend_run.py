@@ -170,6 +170,9 @@ def worst(rows):
         for key, table in (("saturated_after", "ambient"), ("saturated_after_250", "ambient_250")):
             value = most(lambda row, t=table, n=name: row[t][n]["saturated_after"])
             out.setdefault(key, {})[name] = value
+            for field in ("late", "lost"):
+                value = most(lambda row, t=table, n=name, f=field: row[t][n][f])
+                out.setdefault(key.replace("saturated_after", f"{field}_in"), {})[name] = value
     for table in ("step", "step_250"):
         out[table] = {
             key: most(lambda row, t=table, k=key: _larger(row[t]["up"][k], row[t]["down"][k]))
