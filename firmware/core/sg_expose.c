@@ -105,14 +105,14 @@ ONCE static uint8_t change(struct sg_expose_led *led, uint16_t exposure_cycles, 
     return 1;
 }
 
-// A full sample gives a direction, no measure.
-static uint8_t full(struct sg_expose_led *led, uint16_t unlit)
+// A full sample gives a direction, mostly no measure.
+static uint8_t full(struct sg_expose_led *led, uint16_t lit, uint16_t unlit)
 {
     const uint8_t settled = led->stage == SG_EXPOSE_TRACK;
     // Gaze or lids: no more than is needed.
     const uint8_t ours = settled && !above((uint8_t)(unlit >> 2), led->unlit_then, RISEN_Q2);
     const uint8_t shift = unlit >= SG_EXPOSE_SATURATED_CODE ? 4 : ours ? 1 : 3;
-    const uint16_t now = within(led, led->exposure_cycles >> shift);
+    uint16_t now = within(led, led->exposure_cycles >> shift);
     if (now >= led->exposure_cycles)
         return 0;
     uint8_t stage = ours ? SG_EXPOSE_VERIFY : SG_EXPOSE_ACQUIRE;
@@ -121,6 +121,12 @@ static uint8_t full(struct sg_expose_led *led, uint16_t unlit)
             stage = SG_EXPOSE_WATCH;
         if (led->caution < CAUTION_MOST)
             led->caution++;
+        // A crest on its way up: what its unlit code says and half more, so that the next ones fit. To start
+        // over would choose in a trough again.
+        if (unlit < SG_EXPOSE_SATURATED_CODE) {
+            now = wanted(led, led->exposure_cycles, (uint16_t)(unlit + (unlit >> 1)), (int16_t)(lit - unlit));
+            stage = SG_EXPOSE_VERIFY;
+        }
     }
     return change(led, now, stage);
 }
@@ -262,7 +268,7 @@ static uint8_t visit(struct sg_expose *expose, const struct sg_reading *reading,
     if (expose->drowned && led->stage == SG_EXPOSE_TRACK)
         unlit = SG_EXPOSE_SATURATED_CODE;
     if (lit >= SG_EXPOSE_SATURATED_CODE || unlit >= SG_EXPOSE_SATURATED_CODE)
-        return full(led, unlit);
+        return full(led, lit, unlit);
     const uint8_t bright = lit > SG_EXPOSE_BRIGHT_CODE;
     const struct sg_reading *const first = from_channel(reading, before(i, wiring));
     lit = own(lit, first->lit_code[0]);

@@ -76,7 +76,8 @@ void sg_expose_start(struct sg_expose *expose, const uint16_t exposure_cycles[6]
 void sg_expose_taken(struct sg_expose *expose, const uint16_t exposure_cycles[6]);
 
 // One cycle: a look at the next channel; at once at those that are full (our light alone: half of the
-// exposure; else an eighth, or a sixteenth if the unlit code is full too) and at all that are being acquired:
+// exposure; else an eighth, or a sixteenth if the unlit code is full too; soon after a choice what the unlit
+// code of that crest and half more asks for, unless it is full too) and at all that are being acquired:
 // after the start, after being full, and when ambient light fell away. A channel taken with another exposure
 // than the one in force says nothing: a pipeline of any depth does not correct twice.
 //   wiring     enum sg_wiring
