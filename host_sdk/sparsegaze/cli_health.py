@@ -68,6 +68,8 @@ def status(port, as_json):
     volts = "not measured" if now.supply_volts is None else f"{now.supply_volts:.2f} V, give or take 10 %"
     held = "automatic" if exposure.automatic else "held"
     lines = faults.lines(found) or ["no fault"]
+    note = faults.held(exposure, port)
+    lines += [f"note: exposures are {note[0]}: `{note[1]}`"] if note else []
     lines += [""] + pairs(
         [
             ("supply", volts),

@@ -241,8 +241,8 @@ def change(device, port, wanted):
 def exposure(port, mode, fixed, limit, as_json):
     """The six exposure times of the device at PORT, in microseconds. Without options: shows them.
 
-    The device keeps them, and what is asked of them here, through a restart. It clips them to what board and
-    frame rate allow; steps are 1/16 us.
+    The device keeps them, and what is asked of them here, through a restart: a --limit too, which it does not
+    show. It clips them to what board and frame rate allow; steps are 1/16 us.
 
     \b
     Example:
@@ -279,12 +279,13 @@ def exposure(port, mode, fixed, limit, as_json):
         "clipped": clipped,
     }
     mode = "automatic" if now.automatic else "held"
+    least, most = hello.exposure_min_us, hello.exposure_max_us
     console.result(
         data,
         *pairs(
             [
                 ("exposures", " ".join(f"{value:.2f}" for value in now.exposure_us) + f" us, {mode}"),
-                ("limits", f"{hello.exposure_min_us} to {hello.exposure_max_us} us, less at a high rate"),
+                ("board's limits", f"{least} to {most} us, less at a high rate"),
             ]
         ),
     )

@@ -58,6 +58,8 @@ def checks_of(device, port, before):
         checks.append(Check("model", None, "none", f"sparsegaze calibrate {port}"))
     else:
         checks.append(Check("model", True, f"{info.vectors[info.active]} vectors"))
+    held = faults.held(device.exposure(), port)
+    checks += [Check("exposures", None, *held)] if held else []
     checks.append(_rate(status, settings, port))
     bad = status.rx_bad + status.rx_overrun
     checks.append(
@@ -101,10 +103,14 @@ def _rate(status, settings, port):
     said = f"frames: {status.late_frames} late, {status.tx_dropped} not sent; "
     said += f"readings: {status.late_slots} late"
     late = status.late_frames > max(10, LATE_SHARE * status.frames)
+    slower = max(lib.SG_WIRE_RATE_LEAST_HZ, settings.most_hz * 9 // 10)
     if late or status.late_slots or status.tx_dropped:
-        slower = max(lib.SG_WIRE_RATE_LEAST_HZ, settings.most_hz * 9 // 10)
         return Check("rate", None, f"{rate}; {said}", f"sparsegaze settings {port} --rate {slower}")
-    return Check("rate", True, f"{rate}; {said}" if status.late_frames else f"{rate}, nothing late")
+    rate += f"; {said}" if status.late_frames else ", nothing late"
+    if 0 < settings.rate_hz < slower:
+        remedy = f"if that is not what you want: sparsegaze settings {port} --rate max"
+        return Check("rate", None, f"{rate}; set to {settings.rate_hz}", remedy)
+    return Check("rate", True, rate)
 
 
 def _supply(status, found):

@@ -7,8 +7,8 @@ from .errors import CalibrationError
 
 CHANNEL = {
     "open": (
-        "is open: it gives no current at all, lit or not",
-        "check its two solder joints and the wire to {pin}",
+        "is open, or fully covered: it gives no current at all, lit or not",
+        "uncover it; if that is not it, check its two solder joints and the wire to {pin}",
     ),
     "short": (
         "is shorted: full at once, lit or not",
@@ -89,6 +89,13 @@ def refuse_board(device):
     for fault in of(device.status(), getattr(device, "port", "PORT")):
         if fault.name in BOARD:
             raise CalibrationError(fault.text, fault.remedy)
+
+
+def held(exposure, port="PORT"):
+    """(text, remedy) if exposures (wire.Exposure) are held, else None: no fault, but no light is followed."""
+    if exposure.automatic:
+        return None
+    return "held: they do not follow the light", f"sparsegaze exposure {port} --auto"
 
 
 def lines(found):

@@ -26,6 +26,7 @@ HOLD_US = 40_000  # one exposure; four waves of 100 Hz flicker
 SKIP_FRAMES = 3  # after a change: ambient light is interpolated from earlier cycles
 FRAMES_LEAST = 4
 ROUNDS, VERIFY_ROUNDS, CHECK_ROUNDS = 48, 16, 16  # through all fractions: 15 s, 5 s, 5 s
+EARLY_HOLDS = 50  # the first 2 s: light that will not do is told then
 DARK_FRACTIONS, DARK_ROUNDS = (1.0, 0.6, 0.35, 0.2), 8  # of the longest exposures, for unlit codes: 1.3 s
 BEFORE = {  # channel sampled right before each, by enum sg_wiring; -1: ground
     lib.SG_WIRING_LEDS: (5, -1, -1, 2, 1, -1),
@@ -36,6 +37,8 @@ CALM_US, CALM_LIMIT_US = 500_000, 6_000_000
 RATE_HZ = 500
 CODE_WANTED = 600.0  # lit, at the long exposures: automatic ones hardly read more, blinks apart
 LOOK_US = 150_000
+REACHED = 0.8  # of CODE_WANTED lit: the exposures are as long as light lets them be
+DROWNED = 0.5  # of a lit code comes from outside
 AMBIENT_MOVE = 0.15  # of our own light: more, and the light was not steady
 BETTER_SHARE = 0.9  # a second measurement must find at most this much of the shift, or only noise
 
@@ -86,7 +89,8 @@ def run(device, progress=None):
 
     The light need not be known, only steady: an eye that looks straight ahead, or a sheet of paper. Curves
     are stored only once exposures that had no part in finding them agree; and taken back if the device's own
-    features then do not. Exposures and settings are afterwards what they were.
+    features then do not. Exposures and settings are afterwards what they were. A cable that is pulled
+    meanwhile leaves RATE_HZ; a program that is killed leaves exposures held, too.
     progress  called as progress(stage, done, total)
     Raises CalibrationError, with nothing changed, when a channel is at fault, the light too weak or unsteady.
     """
@@ -104,7 +108,8 @@ def run(device, progress=None):
         dark = measure_dark(device)
 
         def look(done, rounds, now, wanted=None):
-            holds = measure(device, long_us, rounds, lambda part: say(done + part))
+            holds = measure(device, long_us, rounds, lambda part: say(done + part), check_light)
+            check_light(holds)
             check_steady(holds)
             return holds, curvefit.fit(holds, now.curve, now.zero_codes, dark, before, wanted)
 
@@ -152,30 +157,33 @@ def _better(before, after, noise):
     return after <= max(BETTER_SHARE * before, 3 * noise)
 
 
-def measure(device, long_us, rounds, say=lambda part: None):
+def measure(device, long_us, rounds, say=lambda part: None, early=lambda holds: None):
     """Alternate between exposures of long_us [6] and fractions of them. Returns the Holds, in order.
 
-    device streams raw and counts; say(rounds done) is called as it goes on.
+    device streams raw and counts; say(rounds done) is called as it goes on, early(the first of the Holds)
+    once after EARLY_HOLDS, if there are more.
     """
     plan = [share for _ in range(rounds) for fraction in FRACTIONS for share in (1.0, fraction)] + [1.0]
     long_us = np.asarray(long_us, float)
-    return _alternate(device, long_us, plan, lambda left: say(rounds - left // (2 * len(FRACTIONS))))
+    return _alternate(device, long_us, plan, lambda left: say(rounds - left // (2 * len(FRACTIONS))), early)
 
 
 def measure_dark(device):
     """Holds of the longest exposures and fractions of these, for their unlit codes; lit ones may be full."""
     longest_us = device.exposure(us=[device.hello.exposure_max_us] * 6).exposure_us
-    return _alternate(device, np.array(longest_us, float), DARK_FRACTIONS * DARK_ROUNDS, lambda left: None)
+    return _alternate(device, np.array(longest_us, float), DARK_FRACTIONS * DARK_ROUNDS)
 
 
-def _alternate(device, long_us, plan, say):
-    """Holds of long_us times every share of `plan`; say(shares left) is called as it goes on."""
+def _alternate(device, long_us, plan, say=lambda left: None, early=lambda holds: None):
+    """Holds of long_us times every share of `plan`; say(shares left) and early() as in measure()."""
     plan, least_us = list(plan), device.hello.exposure_min_us
-    rows, until = [], None
+    rows, until, early_at = [], None, len(plan) - EARLY_HOLDS
     for frame in device.frames():
         if until is None or frame.t_us >= until:
             if not plan:
                 break
+            if len(plan) == early_at:
+                early(_holds(rows, long_us))
             device.exposure(us=np.maximum(long_us * plan.pop(0), least_us))
             until = frame.t_us + HOLD_US
             say(len(plan))
@@ -184,12 +192,34 @@ def _alternate(device, long_us, plan, say):
     return _holds(rows, long_us)
 
 
-def check_steady(holds):
-    """Raise CalibrationError when our light was too weak, or the light around was not steady."""
+def check_light(holds):
+    """Raise CalibrationError when our light was too weak, or drowned by the light around."""
     long = [hold for hold in holds if hold.full]
-    if len(long) < 4:
+    if sum(hold.frames for hold in long) < 4 * FRAMES_LEAST:  # one Hold alone: none shorter is possible
         remedy = "check the cable; `sparsegaze status` names what is wrong"
         raise CalibrationError("too few frames came", remedy)
+    lit, unlit = (np.median([getattr(hold, name) for hold in long], axis=0) for name in ("lit", "unlit"))
+    ours = np.median([hold.lit - hold.unlit for hold in long], axis=0)
+    weak = ours < CODE_LEAST
+    drowned = weak & (lit > REACHED * CODE_WANTED) & (unlit > DROWNED * lit)
+    if drowned.any():
+        check_steady(holds)  # light that came after exposures were found drowns ours, too
+        codes = [f"sensor {i} ({unlit[i]:.0f} of {lit[i]:.0f} codes)" for i in np.flatnonzero(drowned)]
+        raise CalibrationError(
+            f"too much light from outside: {', '.join(codes)}",
+            "shade the headset, or go away from the sun, the window or the lamp, and try again",
+        )
+    if weak.any():
+        where = ", ".join(f"sensor {i} ({ours[i]:.0f} of 1023 codes)" for i in np.flatnonzero(weak))
+        raise CalibrationError(
+            f"too little light to tell a curve: {where}",
+            "put the headset on, or hold a sheet of white paper some centimetres before it",
+        )
+
+
+def check_steady(holds):
+    """Raise CalibrationError when the light around was not steady."""
+    long = [hold for hold in holds if hold.full]
     rate = np.array([hold.unlit / hold.exposure_us for hold in long])
     own = np.maximum(np.median([(hold.lit - hold.unlit) / hold.exposure_us for hold in long], axis=0), 0.1)
     low, high = np.quantile(rate, [0.02, 0.98], axis=0)
@@ -198,14 +228,6 @@ def check_steady(holds):
         raise CalibrationError(
             f"the light around was not steady: it moved by {100 * move.max():.0f} % of the LEDs' own",
             "switch off or cover what flickers or moves, stay in one place, and try again",
-        )
-    ours = np.median([hold.lit - hold.unlit for hold in long], axis=0)
-    weak = np.flatnonzero(ours < CODE_LEAST)
-    if len(weak):
-        where = ", ".join(f"sensor {i} ({ours[i]:.0f} of 1023 codes)" for i in weak)
-        raise CalibrationError(
-            f"too little light to tell a curve: {where}",
-            "put the headset on, or hold a sheet of white paper some centimetres before it",
         )
 
 
@@ -221,7 +243,8 @@ def _settle(device, progress):
         change = frame.t_us if moved or change is None else change
         if frame.t_us - change >= CALM_US or frame.t_us - first >= CALM_LIMIT_US:
             break
-    long_us = np.array(device.exposure(auto=False).exposure_us)
+    # Set, not held: what is set goes to EEPROM only once it has rested, which it does not while this runs.
+    long_us = np.array(device.exposure(us=device.exposure().exposure_us).exposure_us)
     for _ in range(2):  # automatic exposure is content with much less
         lit = _lit_codes(device)
         long_us = np.array(device.exposure(us=long_us * np.clip(CODE_WANTED / lit, 0.25, 4.0)).exposure_us)

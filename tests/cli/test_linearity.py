@@ -11,6 +11,8 @@ from sparsegaze.wire import lib
 
 BEND = np.array([0.020, -0.015, 0.05, 0.0, -0.04, 0.01])
 
+TOLD_US = 7_000_000  # settling, the dark, two seconds: long before all rounds are through
+
 
 def drift(t_us):
     """An eye that drifts a degree a second to and fro, and jumps a third of a degree 1.6 times a second."""
@@ -102,6 +104,14 @@ def test_a_step_in_the_light_is_refused_and_nothing_changed():
     unchanged(device)
 
 
+def test_a_light_that_comes_when_exposures_are_found_is_told_as_unsteady():
+    device = BentSensor(BEND, ambient=lambda t_us: 0.5 if t_us < 5_000_000 else 60.0, frame_us=1999)
+    with pytest.raises(CalibrationError, match="not steady: it moved by"):
+        linearity.run(device)
+    assert device.t_us < 2_000_000 + TOLD_US
+    unchanged(device)
+
+
 def test_a_light_that_flickers_slowly_is_refused():
     device = BentSensor(BEND, ambient=lambda t_us: 2.0 + 2.0 * np.sin(t_us * 1e-6 * 9.0), frame_us=1999)
     with pytest.raises(CalibrationError, match="not steady"):
@@ -109,11 +119,23 @@ def test_a_light_that_flickers_slowly_is_refused():
     unchanged(device)
 
 
-def test_too_weak_a_light_is_refused_and_names_the_sensors():
-    device = BentSensor(BEND, light=0.03, frame_us=1999)
-    with pytest.raises(CalibrationError, match="sensor 5 .*of 1023 codes") as caught:
+@pytest.mark.parametrize("around", [0.0, 0.6], ids=["dark", "more from outside than ours"])
+def test_too_weak_a_light_is_refused_at_once_and_names_the_sensors(around):
+    device = BentSensor(BEND, light=0.03, ambient=lambda t_us: around, frame_us=1999)
+    began = device.t_us
+    with pytest.raises(CalibrationError, match="too little light.* sensor 5 .*of 1023 codes") as caught:
         linearity.run(device)
-    assert "white paper" in caught.value.remedy
+    assert "white paper" in caught.value.remedy and device.t_us - began < TOLD_US
+    unchanged(device)
+
+
+@pytest.mark.parametrize("around", [60.0, 800.0], ids=["sun", "full at any exposure"])
+def test_light_from_outside_is_told_as_such_at_once(around):
+    device = BentSensor(BEND, ambient=lambda t_us: around, frame_us=1999)
+    device.exposures, began = (160,) * 6, device.t_us
+    with pytest.raises(CalibrationError, match="too much light from outside: sensor 0") as caught:
+        linearity.run(device)
+    assert "shade" in caught.value.remedy and device.t_us - began < TOLD_US
     unchanged(device)
 
 
@@ -181,6 +203,34 @@ def test_curves_are_stored_once_other_exposures_agree_and_a_pulled_cable_leaves_
         with pytest.raises(DisconnectedError):
             linearity.run(device)
         assert device.sets == [] and device.curves == (0,) * 6
+
+
+class Stores(BentSensor):
+    """Keeps in EEPROM whether exposures are automatic, as PROTOCOL.md's P13 says: `stored`."""
+
+    def __init__(self, *args, **options):
+        super().__init__(*args, **options)
+        self.stored, self.set_us = True, None
+
+    def exposure(self, us=None, auto=None, limit_us=None):
+        if self.unplug_us is not None and self.t_us >= self.unplug_us:
+            raise DisconnectedError("/dev/fake is gone", "check the cable")
+        if self.set_us is not None and self.t_us - self.set_us > 2_000_000:
+            self.stored = False
+        if us is not None:
+            self.set_us = self.t_us
+        elif auto is not None:
+            self.stored, self.set_us = auto, None
+        return super().exposure(us, auto, limit_us)
+
+
+@pytest.mark.parametrize("after_s", [1, 5, 12, 25])
+def test_a_pulled_cable_leaves_exposures_automatic(after_s):
+    device = Stores(BEND, frame_us=1999)
+    device.unplug_us = device.t_us + after_s * 1_000_000
+    with pytest.raises(DisconnectedError):
+        linearity.run(device)
+    assert device.stored
 
 
 class Fickle(Watched):

@@ -123,6 +123,30 @@ def test_exposure_shows_sets_holds_limits_and_goes_back_to_automatic(command, co
     assert code == 0 and "held" in out and not device.automatic
 
 
+def test_the_limits_that_exposure_shows_are_said_to_be_the_board_s(command, fake):
+    fake()
+    assert "board's limits  4 to 330 us" in command("exposure", "PORT", "--limit", "90")[1]
+
+
+def test_exposures_that_are_held_are_a_note_with_the_way_back(command, fake):
+    device = fake(linear_model())
+    for name in ("status", "doctor"):
+        assert "--auto" not in command(name, "PORT")[1]
+    device.exposure(us=[50] * 6)
+    for name in ("status", "doctor"):
+        code, out, _ = command(name, "PORT")
+        assert code == 0 and "held: they do not follow the light" in out
+        assert "sparsegaze exposure PORT --auto" in out, name
+
+
+@pytest.mark.parametrize("rate, mark", [(0, "ok "), (500, "note"), (720, "ok "), (900, "ok ")])
+def test_a_rate_set_far_below_the_limit_is_a_note(command, fake, rate, mark):
+    fake(linear_model(), limit_hz=800).settings(rate_hz=rate)
+    code, out, _ = command("doctor", "PORT")
+    assert code == 0 and f"{mark:<9} rate: " in out
+    assert ("sparsegaze settings PORT --rate max" in out) == (mark == "note")
+
+
 def test_an_exposure_that_had_to_be_moved_is_said(command, fake):
     fake()
     code, out, err = command("exposure", "PORT", "--set", "1000")
@@ -142,7 +166,7 @@ def test_exposures_that_make_no_sense(command, monkeypatch, args):
 # faults -----------------------------------------------------------------------------------------------------
 
 FAULTS = [
-    (dict(fault=(0, 0, 0, lib.SG_FAULT_OPEN, 0, 0)), "open", "sensor 3 is open", "wire to A3"),
+    (dict(fault=(0, 0, 0, lib.SG_FAULT_OPEN, 0, 0)), "open", "open, or fully covered", "wire to A3"),
     (dict(fault=(lib.SG_FAULT_SHORT, 0, 0, 0, 0, 0)), "short", "sensor 0 is shorted", "solder bridge at A0"),
     (dict(fault=(0, 0, lib.SG_FAULT_LOW, 0, 0, 0)), "low", "sensor 2 gets far less light", "probe PORT"),
     (dict(fault=(0, 0, 0, 0, 0, lib.SG_FAULT_HIGH)), "high", "something lies close before it", "finger"),
