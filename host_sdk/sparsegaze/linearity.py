@@ -38,7 +38,7 @@ RATE_HZ = 500
 CODE_WANTED = 600.0  # lit, at the long exposures: automatic ones hardly read more, blinks apart
 LOOK_US = 150_000
 REACHED = 0.8  # of CODE_WANTED lit: the exposures are as long as light lets them be
-DROWNED = 0.5  # of a lit code comes from outside
+DROWNED = 0.5  # of a lit code comes from outside; light that falls below so much of itself comes and goes
 AMBIENT_MOVE = 0.15  # of our own light: more, and the light was not steady
 BETTER_SHARE = 0.9  # a second measurement must find at most this much of the shift, or only noise
 
@@ -203,7 +203,9 @@ def check_light(holds):
     weak = ours < CODE_LEAST
     drowned = weak & (lit > REACHED * CODE_WANTED) & (unlit > DROWNED * lit)
     if drowned.any():
-        check_steady(holds)  # light that came after exposures were found drowns ours, too
+        low, high = _around(long)
+        if (low < DROWNED * high)[drowned].any():
+            check_steady(holds)  # light that came after exposures were found drowns ours, too
         codes = [f"sensor {i} ({unlit[i]:.0f} of {lit[i]:.0f} codes)" for i in np.flatnonzero(drowned)]
         raise CalibrationError(
             f"too much light from outside: {', '.join(codes)}",
@@ -217,12 +219,16 @@ def check_light(holds):
         )
 
 
+def _around(holds):
+    """(lowest, highest) light around, codes a microsecond [6]; extremes apart."""
+    return np.quantile([hold.unlit / hold.exposure_us for hold in holds], [0.02, 0.98], axis=0)
+
+
 def check_steady(holds):
     """Raise CalibrationError when the light around was not steady."""
     long = [hold for hold in holds if hold.full]
-    rate = np.array([hold.unlit / hold.exposure_us for hold in long])
     own = np.maximum(np.median([(hold.lit - hold.unlit) / hold.exposure_us for hold in long], axis=0), 0.1)
-    low, high = np.quantile(rate, [0.02, 0.98], axis=0)
+    low, high = _around(long)
     move = (high - low) / own
     if move.max() > AMBIENT_MOVE:
         raise CalibrationError(

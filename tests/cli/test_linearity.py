@@ -129,9 +129,11 @@ def test_too_weak_a_light_is_refused_at_once_and_names_the_sensors(around):
     unchanged(device)
 
 
-@pytest.mark.parametrize("around", [60.0, 800.0], ids=["sun", "full at any exposure"])
-def test_light_from_outside_is_told_as_such_at_once(around):
-    device = BentSensor(BEND, ambient=lambda t_us: around, frame_us=1999)
+@pytest.mark.parametrize(
+    "around, wave", [(60.0, 0.0), (60.0, 5.0), (800.0, 0.0)], ids=["sun", "a head that turns", "full always"]
+)
+def test_light_from_outside_is_told_as_such_at_once(around, wave):
+    device = BentSensor(BEND, ambient=lambda t_us: around + wave * np.sin(t_us * 5e-6), frame_us=1999)
     device.exposures, began = (160,) * 6, device.t_us
     with pytest.raises(CalibrationError, match="too much light from outside: sensor 0") as caught:
         linearity.run(device)
