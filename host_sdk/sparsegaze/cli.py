@@ -196,6 +196,7 @@ def _warning(message, category, filename, lineno, file=None, line=None):
 
 
 def _terminate(number, frame):
+    signal.signal(number, signal.SIG_IGN)  # a second one would interrupt the cleaning up
     raise Terminated
 
 

@@ -97,6 +97,34 @@ def test_a_signal_during_a_real_process_ends_it_in_order(tmp_path):
         assert path.read_text().endswith("\n")
 
 
+def test_a_second_sigterm_does_not_interrupt_the_cleaning_up(tmp_path):
+    """`timeout` sends one to the process and one to its group."""
+    script = (
+        "import sys, time, click, sparsegaze.cli\n"
+        "@click.command()\n"
+        "def slow():\n"
+        "    try:\n"
+        "        print('begun', flush=True)\n"
+        "        time.sleep(60)\n"
+        "    finally:\n"
+        "        print('ending', flush=True)\n"
+        "        time.sleep(0.5)\n"
+        "        print('ended', flush=True)\n"
+        "sparsegaze.cli.cli.resolve_command = lambda context, args: ('slow', slow, [])\n"
+        "sparsegaze.cli.main(['slow'])\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout.readline() == "begun\n"
+        process.terminate()
+        assert process.stdout.readline() == "ending\n"
+        process.terminate()
+        out, _ = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert out == "ended\n" and process.returncode in (130, 143)
+
+
 def test_a_reader_that_goes_away_is_no_traceback(tmp_path):
     script = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"

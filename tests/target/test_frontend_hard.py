@@ -109,7 +109,7 @@ def test_light_that_no_exposure_is_short_enough_for_is_flagged(worn, na):
     if na > 100_000:
         assert not (flags(frames[5:]) & lib.SG_FLAG_VALID).any()
     one.control.set("ambient", "dark")
-    one.settle(0.8)
+    one.settle(1.3)     # a supply measured in the flood may be a false alarm until the next, a second later
     one.good(one.run(0.2), "dark again", 0.99)
 
 
